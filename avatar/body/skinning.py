@@ -1,0 +1,55 @@
+"""Linear blend skinning and its inverse, for any kinematic tree."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from avatar.checks import AvatarError, check_shape
+from avatar.geometry.transforms import assemble_transform, invert_affine, rotation_from_axis_angle, transform_points
+
+
+def check_parents(parents: tuple[int, ...]) -> None:
+    """Refuses a kinematic tree whose first joint is not the only root or whose parents do not come first."""
+    if not parents or parents[0] != -1 or any(not 0 <= p < j for j, p in enumerate(parents) if j):
+        raise AvatarError(f"parents: expected -1 first and every parent before its child, got {tuple(parents)}.")
+
+
+def chain_transforms(pose: Tensor, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
+    """Rigid motion of each joint's bone from rest to a pose, along the kinematic tree.
+
+    Joint frames are aligned with the world at rest, as in SMPL: each joint turns its whole subtree about itself.
+
+    Args:
+        pose: ``(B, J, 3)`` axis-angle, radians, relative to the parent.
+        joints: ``(J, 3)`` joint positions at rest, metres.
+        parents: J indices, -1 for the root.
+
+    Returns:
+        ``(B, J, 4, 4)`` posed_from_rest.
+    """
+    dims = check_shape("pose", pose, "B J 3")
+    check_shape("joints", joints, "J 3", J=dims["J"])
+    check_parents(parents)
+    rotations = rotation_from_axis_angle(pose)
+    pivots = joints - (rotations @ joints.unsqueeze(-1)).squeeze(-1)
+    local = assemble_transform(rotations, pivots)
+    chain = [local[:, 0]]
+    for joint in range(1, dims["J"]):
+        chain.append(chain[parents[joint]] @ local[:, joint])
+    return torch.stack(chain, dim=1)
+
+
+def blend_transforms(weights: Tensor, joint_transforms: Tensor) -> Tensor:
+    """Linear blend of joint transforms: ``(..., V, J)`` weights and ``(B, J, 4, 4)`` to ``(B, V, 4, 4)``."""
+    return (weights @ joint_transforms.flatten(-2)).unflatten(-1, (4, 4))
+
+
+def pose_points(points: Tensor, weights: Tensor, joint_transforms: Tensor) -> Tensor:
+    """Forward LBS of canonical points. ``(B, N, 3)`` or ``(N, 3)``, weights ``(..., N, J)`` to ``(B, N, 3)``."""
+    return transform_points(blend_transforms(weights, joint_transforms), points)
+
+
+def unpose_points(points: Tensor, weights: Tensor, joint_transforms: Tensor) -> Tensor:
+    """Inverse LBS (SCANimate eq. 2): posed points ``(B, N, 3)`` back to canonical space with known weights."""
+    return transform_points(invert_affine(blend_transforms(weights, joint_transforms)), points)

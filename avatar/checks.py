@@ -1,0 +1,93 @@
+"""Checks at public borders: shapes, finite values, optional packages, and the one error users see."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+INSTALL_LINES = {
+    "open3d": "pip install 'avatar[mesh]' and, on Debian or Ubuntu, "
+    "apt-get install -y libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0",
+    "newton": "pip install 'avatar[simulate]'",
+    "warp": "pip install 'avatar[simulate]'",
+    "anny": "pip install 'avatar[anny]'",
+    "pyvista": "pip install 'avatar[pictures]' and, on Debian or Ubuntu, apt-get install -y libgl1 libegl1",
+    "pygltflib": "pip install 'avatar[export]'",
+    "pxr": "pip install 'avatar[export]'",
+    "tensorboard": "pip install 'avatar[log]'",
+}
+
+
+class AvatarError(ValueError):
+    """Bad input. The message names the argument or file, what was expected, what came and what to do."""
+
+
+class DataError(AvatarError):
+    """A file that is missing, damaged or does not hold what it should."""
+
+    def __init__(self, path: str | Path, problem: str, mend: str = ""):
+        self.path = Path(path)
+        super().__init__(f"{path}: {problem}" + (f" {mend}" if mend else ""))
+
+
+def check_shape(name: str, value: Any, pattern: str, **dims: int) -> dict[str, int]:
+    """Checks an array or tensor against a pattern such as ``"B N 3"`` and returns its named sizes.
+
+    A number in the pattern is a fixed size, a name is bound at its first use (or by ``dims``) and must agree
+    afterwards, and a leading ``...`` stands for any number of dimensions.
+
+    Raises:
+        AvatarError: naming the argument, the expected pattern and the shape that came.
+    """
+    sizes = dict(dims)
+    expected = pattern.split()
+    shape = tuple(getattr(value, "shape", ()))
+    tail = shape
+    if expected and expected[0] == "...":
+        expected = expected[1:]
+        tail = shape[len(shape) - len(expected) :] if len(shape) >= len(expected) else ()
+    matches = len(tail) == len(expected)
+    for size, token in zip(tail, expected):
+        want = int(token) if token.isdigit() else sizes.setdefault(token, size)
+        matches = matches and size == want
+    if not matches:
+        bound = ", ".join(f"{key}={sizes[key]}" for key in pattern.split() if key in dims)
+        raise AvatarError(
+            f"{name}: expected shape ({pattern.replace(' ', ', ')})"
+            + (f" with {bound}" if bound else "")
+            + f", got {shape if hasattr(value, 'shape') else type(value).__name__}."
+        )
+    return sizes
+
+
+def check_finite(name: str, value: Any) -> None:
+    """Refuses NaN and infinity in an array or tensor, saying how many and where the first one stands.
+
+    Raises:
+        AvatarError: naming the argument and the first bad index.
+    """
+    array = value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)
+    bad = ~np.isfinite(array)
+    if bad.any():
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise AvatarError(
+            f"{name}: expected finite numbers, got {int(bad.sum())} NaN or infinite values of {array.size} "
+            f"(first at index {first}). Remove or repair them before going on."
+        )
+
+
+def require(package: str) -> ModuleType:
+    """Imports an optional package at the place of its use.
+
+    Raises:
+        AvatarError: with the line that installs it, when the package or one of its libraries is missing.
+    """
+    try:
+        return importlib.import_module(package)
+    except (ImportError, OSError) as error:
+        line = INSTALL_LINES.get(package.split(".")[0], f"pip install {package}")
+        raise AvatarError(f"{package} is needed here and cannot be imported ({error}). Run: {line}") from error

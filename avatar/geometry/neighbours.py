@@ -1,0 +1,82 @@
+"""Exact nearest neighbours: KD-trees on the CPU, chunked search on CUDA. Indices only; distances stay in torch."""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from avatar.checks import AvatarError, check_shape
+
+CUDA_CHUNK_PAIRS = 1 << 27  # distances held at once by the CUDA search: 512 MiB in float32
+
+
+def nearest(queries: Tensor, points: Tensor) -> Tensor:
+    """Index of the nearest point to each query. ``(B, N, 3)`` and ``(B, M, 3)`` to ``(B, N)`` int64."""
+    return k_nearest(queries, points, 1).squeeze(-1)
+
+
+@torch.no_grad()
+def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """Indices of the k nearest points to each query, nearest first.
+
+    Exact on every device: distances are sums of squared differences, never the expanded product form, which
+    picks a wrong neighbour for near ties.
+
+    Args:
+        queries: ``(B, N, 3)``.
+        points: ``(B, M, 3)`` with ``M >= k``.
+        k: neighbours a query.
+
+    Returns:
+        ``(B, N, k)`` int64.
+
+    Raises:
+        AvatarError: on wrong shapes, non-finite coordinates (CPU) or fewer than k points.
+    """
+    dims = check_shape("queries", queries, "B N 3")
+    dims = check_shape("points", points, "B M 3", B=dims["B"])
+    if dims["M"] < k:
+        raise AvatarError(f"points: expected at least k={k} points, got {dims['M']}.")
+    if queries.is_cuda:
+        return torch.stack([_k_nearest_chunked(q, p, k) for q, p in zip(queries, points)])
+    found = []
+    for query, cloud in zip(queries.detach().numpy(), points.detach().numpy()):
+        try:
+            _, ids = cKDTree(cloud, balanced_tree=False).query(query, k=k, workers=-1)
+        except ValueError as error:
+            raise AvatarError(f"queries, points: expected finite coordinates ({error}).") from error
+        found.append(torch.from_numpy(ids).reshape(len(query), k))
+    return torch.stack(found).long()
+
+
+def _k_nearest_chunked(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """Brute force over chunks of queries for one cloud, with squares of differences (exact)."""
+    chunk = max(1, CUDA_CHUNK_PAIRS // len(points))
+    found = []
+    for part in queries.split(chunk):
+        squared = (part[:, None, 0] - points[None, :, 0]).square_()
+        for axis in (1, 2):
+            squared.add_((part[:, None, axis] - points[None, :, axis]).square_())
+        found.append(squared.argmin(dim=1, keepdim=True) if k == 1 else squared.topk(k, largest=False).indices)
+    return torch.cat(found)
+
+
+def ball_query(centres: Tensor, points: Tensor, radius: float, k: int) -> Tensor:
+    """Up to k nearest points within a radius of each centre; short lists repeat their nearest point.
+
+    Meant for a constant template: called once, its result cached (CloSET 4, network architecture).
+
+    Args:
+        centres: ``(S, 3)``; points: ``(N, 3)``; radius: metres; k: group size.
+
+    Returns:
+        ``(S, k)`` int64. A centre with no point in reach gets its nearest point k times.
+    """
+    check_shape("centres", centres, "S 3")
+    check_shape("points", points, "N 3")
+    reach = min(k, len(points))
+    ids = k_nearest(centres[None], points[None], reach)[0]
+    distances = (points[ids] - centres[:, None]).norm(dim=-1)
+    ids = torch.where(distances <= radius, ids, ids[:, :1])
+    return torch.cat([ids, ids[:, :1].expand(-1, k - reach)], dim=1)

@@ -1,0 +1,81 @@
+"""Triangle surfaces: areas, normals, sampling, barycentric interpolation."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from avatar.checks import AvatarError, check_shape
+from avatar.records import SurfaceSamples
+
+
+def face_cross_products(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Twice the area-weighted normal of each face. ``(..., V, 3)`` and ``(F, 3)`` to ``(..., F, 3)``."""
+    check_shape("vertices", vertices, "... V 3")
+    check_shape("faces", faces, "F 3")
+    a, b, c = (vertices[..., faces[:, corner], :] for corner in range(3))
+    return torch.linalg.cross(b - a, c - a, dim=-1)
+
+
+def face_areas(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Area of each face, square metres. ``(..., V, 3)`` to ``(..., F)``."""
+    return face_cross_products(vertices, faces).norm(dim=-1) / 2
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Area-weighted unit normals of the vertices. ``(..., V, 3)`` to ``(..., V, 3)``; zero where undefined."""
+    crosses = face_cross_products(vertices, faces)
+    normals = torch.zeros_like(vertices)
+    for corner in range(3):
+        normals = normals.index_add(-2, faces[:, corner], crosses)
+    return torch.nn.functional.normalize(normals, dim=-1, eps=1e-20)
+
+
+def sample_surface(vertices: Tensor, faces: Tensor, count: int, generator: torch.Generator) -> SurfaceSamples:
+    """Points spread over a surface with uniform expected density, without any UV map.
+
+    Stratified over the cumulative area: every stretch of the surface gets its share of points to within one,
+    so the spread is more even than that of independent draws.
+
+    Args:
+        vertices: ``(V, 3)`` metres.
+        faces: ``(F, 3)``.
+        count: number of points, at least 1.
+        generator: CPU random state; the same state gives the same samples.
+
+    Raises:
+        AvatarError: when the surface has no area or ``count`` is not positive.
+    """
+    check_shape("vertices", vertices, "V 3")
+    if count < 1:
+        raise AvatarError(f"count: expected at least 1 point, got {count}.")
+    areas = face_areas(vertices, faces).double().cpu()
+    cumulative = areas.cumsum(0)
+    if not torch.isfinite(cumulative[-1]) or cumulative[-1] <= 0:
+        raise AvatarError(f"vertices: expected a surface with area, got a total of {float(cumulative[-1])} m^2.")
+    strata = (torch.arange(count) + torch.rand(count, generator=generator, dtype=torch.float64)) / count
+    face_ids = torch.searchsorted(cumulative, strata * cumulative[-1]).clamp(max=len(faces) - 1)
+    root, along = torch.rand(2, count, generator=generator, dtype=torch.float64)
+    root = root.sqrt()
+    barycentric = torch.stack([1 - root, root * (1 - along), root * along], dim=-1)
+    samples = SurfaceSamples(faces.cpu()[face_ids], barycentric.to(vertices.dtype), face_ids)
+    return samples.to(vertices.device)
+
+
+def interpolate(values: Tensor, samples: SurfaceSamples) -> Tensor:
+    """Barycentric interpolation of per-vertex values (CloSET eq. 2). ``(..., V, C)`` to ``(..., N, C)``.
+
+    Weighted gathers, one corner at a time: differentiable, and no ``(N, 3, C)`` array is ever made.
+    """
+    check_shape("values", values, "... V C")
+    weights = samples.barycentric.to(values.dtype)
+    ids = samples.vertex_ids
+    blended = values.index_select(-2, ids[:, 0]) * weights[:, :1]
+    for corner in (1, 2):
+        blended = blended + values.index_select(-2, ids[:, corner]) * weights[:, corner : corner + 1]
+    return blended
+
+
+def interpolate_transforms(transforms: Tensor, samples: SurfaceSamples) -> Tensor:
+    """Barycentric blend of per-vertex transforms, as POP blends vtransf. ``(..., V, 4, 4)`` to ``(..., N, 4, 4)``."""
+    return interpolate(transforms.flatten(-2), samples).unflatten(-1, transforms.shape[-2:])

@@ -1,0 +1,62 @@
+"""Rigid and affine transforms as (..., 4, 4) matrices, named destination_from_source."""
+
+from __future__ import annotations
+
+import roma
+import torch
+from torch import Tensor
+
+from avatar.checks import check_shape
+
+
+def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
+    """Rotation matrices of axis-angle vectors. ``(..., 3)`` radians to ``(..., 3, 3)``; smooth at zero."""
+    check_shape("axis_angle", axis_angle, "... 3")
+    return roma.rotvec_to_rotmat(axis_angle)
+
+
+def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
+    """Axis-angle vectors of rotation matrices. ``(..., 3, 3)`` to ``(..., 3)`` radians, angles in [0, pi]."""
+    check_shape("rotation", rotation, "... 3 3")
+    return roma.rotmat_to_rotvec(rotation)
+
+
+def assemble_transform(linear: Tensor, shift: Tensor) -> Tensor:
+    """``(..., 4, 4)`` transforms from linear parts ``(..., 3, 3)`` and shifts ``(..., 3)``."""
+    check_shape("linear", linear, "... 3 3")
+    check_shape("shift", shift, "... 3")
+    top = torch.cat([linear, shift.unsqueeze(-1)], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def transform_points(transforms: Tensor, points: Tensor) -> Tensor:
+    """Applies one transform to each point. ``(..., 4, 4)`` and ``(..., 3)``, broadcast over leading dimensions."""
+    return transform_directions(transforms, points) + transforms[..., :3, 3]
+
+
+def transform_directions(transforms: Tensor, directions: Tensor) -> Tensor:
+    """Applies the linear parts alone: offsets and (unnormalised) normals. Shapes as `transform_points`."""
+    return (transforms[..., :3, :3] @ directions.unsqueeze(-1)).squeeze(-1)
+
+
+def invert_rigid(transforms: Tensor) -> Tensor:
+    """Inverse of rigid transforms ``(..., 4, 4)``, exact and without a matrix inversion."""
+    inverse_rotation = transforms[..., :3, :3].transpose(-1, -2)
+    return assemble_transform(inverse_rotation, -(inverse_rotation @ transforms[..., :3, 3:]).squeeze(-1))
+
+
+def invert_affine(transforms: Tensor) -> Tensor:
+    """Inverse of affine transforms ``(..., 4, 4)`` (blended skinning transforms are affine, not rigid)."""
+    inverse_linear = torch.linalg.inv(transforms[..., :3, :3])
+    return assemble_transform(inverse_linear, -(inverse_linear @ transforms[..., :3, 3:]).squeeze(-1))
+
+
+def rotation_between(source: Tensor, target: Tensor) -> Tensor:
+    """The smallest rotation that turns one direction onto another. ``(3,)`` each, to ``(3, 3)``."""
+    source, target = source / source.norm(), target / target.norm()
+    axis = torch.linalg.cross(source, target)
+    angle = torch.atan2(axis.norm(), source @ target)
+    if axis.norm() < 1e-12:
+        return torch.eye(3, dtype=source.dtype, device=source.device)
+    return rotation_from_axis_angle(axis / axis.norm() * angle)
