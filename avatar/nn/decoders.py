@@ -1,0 +1,62 @@
+"""Point decoders: from features and a position to a local offset and normal."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from avatar.checks import AvatarError
+from avatar.nn.pointnet2 import PointNorm
+
+
+@dataclass
+class DecoderConfig:
+    """Sizes of a point decoder; defaults are POP's shape decoder."""
+
+    width: int = 256
+    trunk: int = 4  # layers before the input is joined again
+    branch: int = 2  # hidden layers of the offset branch and of the normal branch, after the joining layer
+
+    def __post_init__(self):
+        if self.width < 1 or self.trunk < 1 or self.branch < 0:
+            raise AvatarError(f"width, trunk, branch: expected positive sizes, got {vars(self)}.")
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Per point, in the body's local frame: ``offsets (B, N, 3)`` and unnormalised ``normals (B, N, 3)``."""
+
+    offsets: Tensor
+    normals: Tensor
+
+    def __add__(self, other: Decoded) -> Decoded:
+        return Decoded(self.offsets + other.offsets, self.normals + other.normals)
+
+
+def softplus_mlp(widths: tuple[int, ...]) -> nn.Sequential:
+    """Linear, normalisation, softplus for each consecutive pair of widths."""
+    layers = []
+    for fan_in, fan_out in itertools.pairwise(widths):
+        layers += [nn.Linear(fan_in, fan_out), PointNorm(fan_out), nn.Softplus()]
+    return nn.Sequential(*layers)
+
+
+class ShapeDecoder(nn.Module):
+    """The decoder POP, SCALE and CloSET share: a trunk, the input joined again, then an offset and a normal branch."""
+
+    def __init__(self, channels: int, config: DecoderConfig):
+        super().__init__()
+        width = config.width
+        self.trunk = softplus_mlp((channels,) + (width,) * config.trunk)
+        self.join = softplus_mlp((channels + width, width))
+        hidden = (width,) * (config.branch + 1)
+        self.offset_branch = nn.Sequential(*softplus_mlp(hidden), nn.Linear(width, 3))
+        self.normal_branch = nn.Sequential(*softplus_mlp(hidden), nn.Linear(width, 3))
+
+    def forward(self, features: Tensor) -> Decoded:
+        """``(B, N, C)`` point features to offsets and normals ``(B, N, 3)``."""
+        joined = self.join(torch.cat([features, self.trunk(features)], dim=-1))
+        return Decoded(self.offset_branch(joined), self.normal_branch(joined))

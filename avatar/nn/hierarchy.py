@@ -1,0 +1,72 @@
+"""Everything in PointNet++ that depends on the template alone, computed once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from avatar.checks import AvatarError, check_shape
+from avatar.geometry.neighbours import ball_query, k_nearest
+from avatar.geometry.sampling import farthest_points
+
+
+@dataclass
+class HierarchyConfig:
+    """Sizes of the levels of a point hierarchy, finest first."""
+
+    points: tuple[int, ...] = (4096, 2048, 1024, 512, 256, 128)
+    radii: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # metres
+    neighbours: int = 32  # group size of every ball query
+
+    def __post_init__(self):
+        self.points, self.radii = tuple(self.points), tuple(self.radii)
+        if len(self.points) != len(self.radii) or not self.points:
+            raise AvatarError(
+                f"points, radii: expected one radius a level, got {len(self.points)} and {len(self.radii)}."
+            )
+        if any(a <= b for a, b in zip(self.points, self.points[1:])) or min(self.radii) <= 0:
+            raise AvatarError(
+                f"points, radii: expected falling sizes and positive radii, got {self.points}, {self.radii}."
+            )
+
+
+class Level(nn.Module):
+    """One step of a hierarchy: how to gather from the finer level, and how to interpolate back to it.
+
+    Buffers: ``positions (S, 3)`` of this level's points, ``finer_positions (N, 3)``, ``groups (S, K)`` ball-query
+    neighbours in the finer level, ``up_ids (N, 3)`` and ``up_weights (N, 3)`` inverse-squared-distance weights of
+    the three nearest coarse points (PointNet++ eq. 2).
+    """
+
+    def __init__(self, finer: Tensor, count: int, radius: float, neighbours: int):
+        super().__init__()
+        coarse = finer[farthest_points(finer, count)]
+        up_ids = k_nearest(finer[None], coarse[None], min(3, count))[0]
+        inverse = 1 / ((finer[:, None] - coarse[up_ids]).square().sum(dim=-1) + 1e-8)
+        for name, value in {
+            "positions": coarse,
+            "finer_positions": finer,
+            "groups": ball_query(coarse, finer, radius, neighbours),
+            "up_ids": up_ids,
+            "up_weights": inverse / inverse.sum(dim=1, keepdim=True),
+        }.items():
+            self.register_buffer(name, value.clone(), persistent=False)
+
+
+def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:
+    """The levels of a hierarchy over constant points ``(V, 3)``, finest first; nested farthest-point subsets.
+
+    Raises:
+        AvatarError: when the template has no more points than the finest level.
+    """
+    dims = check_shape("positions", positions, "V 3")
+    if dims["V"] <= config.points[0]:
+        raise AvatarError(
+            f"points: expected a finest level below the template's {dims['V']} vertices, got {config.points[0]}."
+        )
+    levels, finer = nn.ModuleList(), positions.detach()
+    for count, radius in zip(config.points, config.radii):
+        levels.append(Level(finer, count, radius, config.neighbours))
+        finer = levels[-1].positions
+    return levels

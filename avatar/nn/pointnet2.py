@@ -1,0 +1,136 @@
+"""PointNet++ on a constant template: set abstraction, feature propagation, and their surface encoder."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from avatar.checks import AvatarError, check_shape
+from avatar.nn.hierarchy import HierarchyConfig, Level, build_levels
+from avatar.records import Template
+
+
+@dataclass
+class PointNet2Config:
+    """Channels of a PointNet++ encoder; defaults are the full pose encoder, about 10.2 M parameters."""
+
+    hierarchy: HierarchyConfig = field(default_factory=HierarchyConfig)
+    abstraction: tuple[tuple[int, ...], ...] = (
+        (64, 64, 128),
+        (128, 128, 256),
+        (256, 256, 512),
+        (512, 512, 512),
+        (512, 512, 1024),
+        (1024, 1024, 1024),
+    )  # channels of each set abstraction, finest first
+    propagation: tuple[tuple[int, ...], ...] = (
+        (1024, 512),
+        (512, 512),
+        (512, 512),
+        (512, 256),
+        (256, 128),
+        (128, 64),
+    )  # channels of each feature propagation, coarsest first
+
+    def __post_init__(self):
+        self.abstraction = tuple(tuple(widths) for widths in self.abstraction)
+        self.propagation = tuple(tuple(widths) for widths in self.propagation)
+        counts = {len(self.hierarchy.points), len(self.abstraction), len(self.propagation)}
+        if len(counts) != 1 or not all(self.abstraction + self.propagation):
+            raise AvatarError(
+                "abstraction, propagation: expected one non-empty channel list for each of the "
+                f"{len(self.hierarchy.points)} levels, got {len(self.abstraction)} and {len(self.propagation)}."
+            )
+
+
+class PointNorm(nn.BatchNorm1d):
+    """Batch normalisation over every dimension but the last: ``(..., C)`` to ``(..., C)``."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        return super().forward(features.flatten(0, -2)).view_as(features)
+
+
+def point_mlp(widths: tuple[int, ...]) -> nn.Sequential:
+    """Linear, normalisation, ReLU for each consecutive pair of widths; acts on the last dimension."""
+    layers = []
+    for fan_in, fan_out in itertools.pairwise(widths):
+        layers += [nn.Linear(fan_in, fan_out), PointNorm(fan_out), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+class SetAbstraction(nn.Module):
+    """Groups each coarse point's neighbours, maps them through a shared network and takes the maximum.
+
+    The first layer sees [neighbour feature, relative position] and is linear, so it is applied once a point before
+    gathering, not once a neighbour: W_f f_j + W_p (x_j - x_i) = (W_f f_j + W_p x_j) - W_p x_i, exactly.
+    """
+
+    def __init__(self, level: Level, channels: int, widths: tuple[int, ...]):
+        super().__init__()
+        self.level = level
+        self.feature_layer = nn.Linear(channels, widths[0])
+        self.position_layer = nn.Linear(3, widths[0], bias=False)
+        self.first = nn.Sequential(PointNorm(widths[0]), nn.ReLU())
+        self.rest = point_mlp(widths)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(B, N, C)`` features of the finer level to ``(B, S, C')`` of the coarser."""
+        level = self.level
+        lifted = self.feature_layer(features) + self.position_layer(level.finer_positions)
+        grouped = lifted[:, level.groups] - self.position_layer(level.positions)[:, None]
+        return self.rest(self.first(grouped)).amax(dim=2)
+
+
+class FeaturePropagation(nn.Module):
+    """Interpolates coarse features to the finer level, joins the finer level's own and maps both."""
+
+    def __init__(self, level: Level, coarse_channels: int, fine_channels: int, widths: tuple[int, ...]):
+        super().__init__()
+        self.level = level
+        self.mlp = point_mlp((coarse_channels + fine_channels, *widths))
+
+    def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
+        """``(B, S, C)`` and ``(B, N, C')`` to ``(B, N, C'')``."""
+        level = self.level
+        weights = level.up_weights.to(coarse.dtype)
+        spread = coarse[:, level.up_ids[:, 0]] * weights[:, :1]
+        for corner in range(1, weights.shape[1]):
+            spread = spread + coarse[:, level.up_ids[:, corner]] * weights[:, corner : corner + 1]
+        return self.mlp(torch.cat([spread, fine], dim=-1))
+
+
+class PointNet2(nn.Module):
+    """Hierarchical features on a body surface (CloSET 3.1, eq. 1): one vector for every template vertex.
+
+    The template's vertices are the point cloud; what changes from frame to frame (posed vertices, a garment code)
+    comes as features. All sampling and grouping is computed once, here.
+    """
+
+    def __init__(self, template: Template, channels: int, config: PointNet2Config):
+        """Builds the encoder for one template and ``channels`` input features a vertex."""
+        super().__init__()
+        self.channels = channels
+        self.out_channels = config.propagation[-1][-1]
+        levels = build_levels(template.vertices, config.hierarchy)
+        self.abstractions, widths = nn.ModuleList(), [channels]
+        for level, mlp in zip(levels, config.abstraction):
+            self.abstractions.append(SetAbstraction(level, widths[-1], mlp))
+            widths.append(mlp[-1])
+        self.propagations, coarse = nn.ModuleList(), widths.pop()
+        for level, mlp in zip(reversed(levels), config.propagation):
+            self.propagations.append(FeaturePropagation(level, coarse, widths.pop(), mlp))
+            coarse = mlp[-1]
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(B, V, C)`` features on the template's vertices to ``(B, V, C')``."""
+        check_shape("features", features, "B V C", C=self.channels)
+        pyramid = [features]
+        for abstraction in self.abstractions:
+            pyramid.append(abstraction(pyramid[-1]))
+        coarse = pyramid.pop()
+        for propagation in self.propagations:
+            coarse = propagation(coarse, pyramid.pop())
+        return coarse

@@ -1,0 +1,144 @@
+"""CloSET's network: its equations, its switches and its invariances, on a small body."""
+
+import pytest
+import torch
+
+from avatar.checks import AvatarError
+from avatar.geometry.surface import interpolate, sample_surface
+from avatar.nn.closet import ClosetAvatar, ClosetConfig
+from avatar.nn.decoders import DecoderConfig
+from avatar.nn.hierarchy import HierarchyConfig
+from avatar.nn.methods import build_avatar, find_method
+from avatar.nn.pointnet2 import PointNet2Config
+from avatar.records import Batch
+from tests.nn.test_pointnet2 import sphere_template
+
+TEMPLATE = sphere_template()
+ENCODER = PointNet2Config(HierarchyConfig((40, 10), (0.5, 1.5), 6), ((8,), (8,)), ((8,), (4,)))
+DECODER = DecoderConfig(width=16, trunk=1, branch=0)
+
+
+def small_config(**switches) -> ClosetConfig:
+    return ClosetConfig(ENCODER, ENCODER, DECODER, DECODER, code_channels=6, **switches)
+
+
+def random_batch(frames: int = 3, outfits: tuple[int, ...] = (0, 1, 0)) -> Batch:
+    torch.manual_seed(1)
+    count = len(TEMPLATE.vertices)
+    transforms = torch.eye(4).repeat(frames, count, 1, 1)
+    transforms[..., :3, :3] += 0.1 * torch.randn(frames, 1, 3, 3)
+    transforms[..., :3, 3] = torch.randn(frames, 1, 3)
+    vertices = (transforms[..., :3, :3] @ TEMPLATE.vertices[:, :, None])[..., 0] + transforms[..., :3, 3]
+    scans = torch.randn(frames, 50, 3)
+    return Batch(
+        pose_vertices=vertices,
+        vertices=vertices,
+        vertex_transforms=transforms,
+        joint_transforms=transforms[:, :1],
+        scan_points=scans,
+        scan_normals=scans,
+        outfit_ids=torch.tensor(outfits[:frames]),
+        names=tuple(f"walk.{i:05d}" for i in range(frames)),
+    )
+
+
+def template_points(count: int = 200):
+    return sample_surface(TEMPLATE.vertices, TEMPLATE.faces, count, torch.Generator().manual_seed(0))
+
+
+def avatar(**switches) -> ClosetAvatar:
+    torch.manual_seed(0)
+    return ClosetAvatar(TEMPLATE, 2, small_config(**switches)).eval()
+
+
+def test_points_are_the_transformed_offset_on_the_posed_body():
+    batch, samples = random_batch(), template_points()
+    prediction = avatar()(batch, samples)
+    bodies = interpolate(batch.vertices, samples)
+    linear = batch.vertex_transforms[:, 0, :3, :3]  # one transform a frame in this batch
+    expected = bodies + prediction.offsets @ linear.transpose(1, 2)
+    torch.testing.assert_close(prediction.points, expected)
+    torch.testing.assert_close(prediction.normals.norm(dim=-1), torch.ones(3, 200))
+
+
+def test_offset_is_garment_plus_wrinkle_and_scaled():
+    batch, samples = random_batch(), template_points()
+    model = avatar()
+    prediction = model(batch, samples)
+    torch.testing.assert_close(prediction.offsets, prediction.garment_offsets + prediction.wrinkle_offsets)
+    model.config.offset_scale *= 2
+    torch.testing.assert_close(model(batch, samples).offsets, 2 * prediction.offsets)
+
+
+def test_template_is_one_for_all_poses_and_differs_by_outfit():
+    batch, samples = random_batch(), template_points()
+    model = avatar()
+    prediction = model(batch, samples)
+    torch.testing.assert_close(prediction.garment_offsets[0], prediction.garment_offsets[2])
+    assert (prediction.garment_offsets[0] - prediction.garment_offsets[1]).abs().max() > 0
+    assert (prediction.wrinkle_offsets[0] - prediction.wrinkle_offsets[2]).abs().max() > 0
+    template = model.garment_template(0, samples)
+    resting = interpolate(TEMPLATE.vertices, samples)
+    torch.testing.assert_close(template.offsets[0], resting + prediction.garment_offsets[0])
+
+
+def test_static_floor_ignores_the_pose_and_csf_has_no_template():
+    batch, samples = random_batch(), template_points()
+    static = avatar(pose=False)
+    prediction = static(batch, samples)
+    assert prediction.wrinkle_offsets is None
+    torch.testing.assert_close(prediction.offsets[0], prediction.offsets[2])
+    csf = avatar(template=False)
+    prediction = csf(batch, samples)
+    assert prediction.garment_offsets is None
+    torch.testing.assert_close(prediction.offsets, prediction.wrinkle_offsets)
+    with pytest.raises(AvatarError, match="without an explicit garment template"):
+        csf.garment_template(0, samples)
+    with pytest.raises(AvatarError, match="at least one branch"):
+        small_config(template=False, pose=False)
+
+
+def test_garment_branch_runs_once_an_outfit(monkeypatch):
+    model, seen = avatar(), []
+    forward = model.garment_encoder.forward
+    monkeypatch.setattr(model.garment_encoder, "forward", lambda codes: seen.append(len(codes)) or forward(codes))
+    model(random_batch(), template_points())
+    assert seen == [2]
+
+
+def test_point_count_is_free_and_points_are_independent():
+    batch, many = random_batch(), template_points(400)
+    model = avatar()
+    few = type(many)(many.vertex_ids[::4], many.barycentric[::4], many.face_ids[::4])
+    torch.testing.assert_close(model(batch, few).points, model(batch, many).points[:, ::4], rtol=1e-5, atol=1e-5)
+
+
+def test_frames_do_not_see_each_other():
+    batch, samples = random_batch(), template_points()
+    model = avatar()
+    alone = Batch(**{k: v[:1] for k, v in vars(batch).items()})
+    torch.testing.assert_close(model(alone, samples).points, model(batch, samples).points[:1], rtol=1e-5, atol=1e-5)
+
+
+def test_pose_noise_acts_in_training_only():
+    batch, samples = random_batch(), template_points()
+    quiet, noisy = avatar(), avatar(pose_noise=0.1)
+    torch.testing.assert_close(noisy(batch, samples).points, quiet(batch, samples).points)
+    torch.manual_seed(0)
+    first = noisy.train()(batch, samples).points
+    assert (first - noisy(batch, samples).points).abs().max() > 1e-6
+
+
+def test_every_parameter_gets_a_gradient():
+    model = avatar().train()
+    prediction = model(random_batch(), template_points())
+    (prediction.points.square().sum() + prediction.normals[..., 0].sum()).backward()
+    assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.isfinite().all()] == []
+
+
+def test_registry_names_its_methods():
+    with pytest.raises(AvatarError, match="closet"):
+        find_method("clsoet")
+    with pytest.raises(AvatarError, match="ClosetConfig"):
+        build_avatar("closet", TEMPLATE, 1, DECODER)
+    assert isinstance(build_avatar("closet", TEMPLATE, 1, small_config()), ClosetAvatar)

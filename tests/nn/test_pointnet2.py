@@ -1,0 +1,100 @@
+"""The surface encoder against per-neighbour loops, parameter counts and invariances."""
+
+import pytest
+import torch
+import trimesh
+
+from avatar.body.open import open_body
+from avatar.checks import AvatarError
+from avatar.nn.closet import FULL_GARMENT_ENCODER, ClosetConfig
+from avatar.nn.decoders import DecoderConfig, ShapeDecoder
+from avatar.nn.hierarchy import HierarchyConfig, build_levels
+from avatar.nn.pointnet2 import FeaturePropagation, PointNet2, PointNet2Config, SetAbstraction
+from avatar.records import Template
+
+SIZES = HierarchyConfig(points=(40, 10), radii=(0.5, 1.5), neighbours=6)
+
+
+def sphere_template(subdivisions: int = 2) -> Template:
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
+    vertices = torch.from_numpy(sphere.vertices).float()
+    return Template(
+        vertices=vertices,
+        faces=torch.from_numpy(sphere.faces).long(),
+        weights=torch.ones(len(vertices), 1),
+        joints=torch.zeros(1, 3),
+        parents=(-1,),
+        joint_names=("root",),
+    )
+
+
+def parameters(module: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def test_full_encoders_and_decoders_have_the_published_sizes():
+    template = open_body().template
+    assert parameters(PointNet2(template, 3, PointNet2Config())) == 10_243_136
+    assert parameters(PointNet2(template, 64, PointNet2Config(**FULL_GARMENT_ENCODER))) == 280_928
+    assert [parameters(ShapeDecoder(c, DecoderConfig())) for c in (67, 131, 132)] == [567_046, 599_814, 600_326]
+    assert ClosetConfig().code_channels == 64
+
+
+def test_levels_are_nested_and_interpolation_weights_follow_inverse_squares():
+    points = sphere_template().vertices
+    fine, coarse = build_levels(points, SIZES)
+    assert torch.equal(coarse.finer_positions, fine.positions)
+    for row in range(0, len(points), 17):
+        distances = (points[row] - fine.positions).square().sum(dim=1)
+        torch.testing.assert_close(distances[fine.up_ids[row]], distances.topk(3, largest=False).values)
+        weights = 1 / (distances[fine.up_ids[row]] + 1e-8)
+        torch.testing.assert_close(fine.up_weights[row], weights / weights.sum())
+    assert (coarse.up_weights.sum(dim=1) - 1).abs().max() < 1e-6
+
+
+def test_set_abstraction_equals_the_layer_applied_to_every_neighbour():
+    torch.manual_seed(0)
+    level = build_levels(sphere_template().vertices, SIZES)[0]
+    layer = SetAbstraction(level, 5, (8, 7)).double().eval()
+    features = torch.randn(2, len(level.finer_positions), 5, dtype=torch.float64)
+    weight = torch.cat([layer.feature_layer.weight, layer.position_layer.weight], dim=1)
+    slow = []
+    for centre, group in enumerate(level.groups):
+        relative = (level.finer_positions[group] - level.positions[centre]).expand(2, -1, -1)
+        joined = torch.cat([features[:, group], relative], dim=-1)
+        slow.append(layer.rest(layer.first(joined @ weight.T + layer.feature_layer.bias)).amax(dim=1))
+    torch.testing.assert_close(layer(features), torch.stack(slow, dim=1))
+
+
+def test_feature_propagation_returns_coarse_values_at_coarse_points():
+    level = build_levels(sphere_template().vertices.double(), SIZES)[0]
+    layer = FeaturePropagation(level, 4, 2, (4,))
+    layer.mlp = torch.nn.Identity()
+    coarse = torch.randn(1, 40, 4, dtype=torch.float64)
+    spread = layer(coarse, torch.zeros(1, 162, 2, dtype=torch.float64))
+    shared = (level.finer_positions[:, None] - level.positions[None]).norm(dim=-1).min(dim=0).indices
+    torch.testing.assert_close(spread[:, shared, :4], coarse, rtol=1e-5, atol=1e-5)
+
+
+def test_encoder_treats_frames_independently_and_sees_far_parts():
+    torch.manual_seed(0)
+    template = sphere_template()
+    config = PointNet2Config(HierarchyConfig((40, 10), (0.5, 2.5), 40), ((8,), (8,)), ((8,), (4,)))
+    encoder = PointNet2(template, 3, config).eval()
+    features = torch.randn(3, 162, 3)
+    together = encoder(features)
+    torch.testing.assert_close(together[1:2], encoder(features[1:2]))
+    moved = features.clone()
+    moved[0, template.vertices[:, 1].argmax()] += 10
+    assert (encoder(moved)[0] - together[0]).abs()[template.vertices[:, 1] < -0.5].max() > 0
+
+
+def test_bad_sizes_are_refused():
+    with pytest.raises(AvatarError, match="one radius a level"):
+        HierarchyConfig(points=(4, 2), radii=(0.1,))
+    with pytest.raises(AvatarError, match="falling sizes"):
+        HierarchyConfig(points=(2, 4), radii=(0.1, 0.2))
+    with pytest.raises(AvatarError, match="162 vertices"):
+        build_levels(sphere_template().vertices, HierarchyConfig(points=(200, 4), radii=(0.1, 0.2)))
+    with pytest.raises(AvatarError, match="one non-empty channel list"):
+        PointNet2Config(SIZES, ((8,),), ((8,), (4,)))
