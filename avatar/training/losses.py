@@ -1,0 +1,92 @@
+"""What point avatars are trained on: Chamfer, normals and regularisers, each a named and weighted term."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from torch import Tensor
+
+from avatar.checks import AvatarError
+from avatar.geometry.distances import (
+    correspond,
+    gather_points,
+    normal_difference,
+    point_to_plane,
+    point_to_point,
+)
+from avatar.records import Batch, LossTerms, Prediction
+
+TERMS = ("scan_to_points", "points_to_scan", "normal", "offset", "wrinkle", "code")
+
+
+class Chamfer(Enum):
+    """The prediction-to-scan half of the Chamfer term."""
+
+    point = "point"  # CloSET eq. 4
+    plane = "plane"  # POP
+
+
+@dataclass
+class LossConfig:
+    """Weights of the point avatars' loss terms; metres. POP's numbers, from which CloSET's own are not known."""
+
+    chamfer: Chamfer = Chamfer.point
+    scan_to_points: float = 1e4
+    points_to_scan: float = 1e4
+    normal: float = 1.0
+    normal_start: float = 0.6  # share of training after which the normal term counts (POP: epoch 250 of 400)
+    normal_before: float = 1e-6  # factor on the normal term until then
+    offset: float = 2e3  # mean |r|^2
+    wrinkle: float = 0.0  # mean |r^p|^2
+    code: float = 1.0  # mean square of the garment codes
+
+    def __post_init__(self):
+        weights = {key: value for key, value in vars(self).items() if key != "chamfer"}
+        wrong = {key: value for key, value in weights.items() if value < 0}
+        if wrong or not 0 <= self.normal_start <= 1:
+            raise AvatarError(
+                f"loss: expected weights of at least 0 and normal_start in [0, 1], got {wrong or weights}."
+            )
+
+
+def point_avatar_loss(prediction: Prediction, batch: Batch, config: LossConfig, progress: float) -> LossTerms:
+    """CloSET's objective (eqs. 4-6): L = lp Lp + ln Ln + lrgl Lrgl, every part named.
+
+    Args:
+        prediction: what the network gave for the batch.
+        batch: with ``scan_points`` and ``scan_normals (B, M, 3)``.
+        config: weights and switches.
+        progress: share of the training that is done, in [0, 1]; the normal term is switched on by it.
+
+    Returns:
+        `LossTerms` reduced to means over points and frames: square metres for distances, L1 of unit normals
+        (mean over the three components, as POP's code averages it).
+    """
+    found = correspond(prediction.points.detach(), batch.scan_points)
+    anchors = gather_points(batch.scan_points, found.scan_of_point)
+    anchor_normals = gather_points(batch.scan_normals, found.scan_of_point)
+    if config.chamfer is Chamfer.plane:
+        to_scan = point_to_plane(prediction.points, anchors, anchor_normals)
+    else:
+        to_scan = point_to_point(prediction.points, anchors)
+    to_points = point_to_point(batch.scan_points, gather_points(prediction.points, found.point_of_scan))
+    raw = {
+        "scan_to_points": to_points.mean(),
+        "points_to_scan": to_scan.mean(),
+        "normal": normal_difference(prediction.normals, anchor_normals).mean() / 3,
+        "offset": squared_norm(prediction.offsets),
+    }
+    if prediction.wrinkle_offsets is not None:
+        raw["wrinkle"] = squared_norm(prediction.wrinkle_offsets)
+    if prediction.codes is not None:
+        raw["code"] = prediction.codes.square().mean()
+    weights = {name: getattr(config, name) for name in raw}
+    if progress < config.normal_start:
+        weights["normal"] *= config.normal_before
+    return LossTerms(raw, {name: value * weights[name] for name, value in raw.items() if weights[name]})
+
+
+def squared_norm(offsets: Tensor) -> Tensor:
+    """Mean squared length of offsets ``(..., 3)``, square metres (CloSET eq. 6)."""
+    return offsets.square().sum(dim=-1).mean()
