@@ -1,0 +1,21 @@
+# Two commands on a fresh machine: `make demo` sets up what it needs and runs the main job; `make test` sets up, lints and tests.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test lint setup setup-test
+
+setup:
+	@PYTHON=$(PYTHON) sh tools/setup.sh demo
+
+setup-test:
+	@PYTHON=$(PYTHON) sh tools/setup.sh test
+
+demo: setup
+	$(BIN)/python tools/demo.py
+
+lint: setup-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+test: lint
+	$(BIN)/python -m pytest

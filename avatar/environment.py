@@ -1,0 +1,91 @@
+"""What this machine has, what it lacks, and the line that mends it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+
+from avatar.checks import INSTALL_LINES
+
+APT_PACKAGES = {
+    "libusb-1.0": "libusb-1.0-0",
+    "libGL.so": "libgl1",
+    "libEGL.so": "libegl1",
+    "libX11.so": "libx11-6",
+    "libudev.so": "libudev1",
+    "libidn2.so": "libidn2-0",
+    "libgomp.so": "libgomp1",
+    "libXrender.so": "libxrender1",
+}
+CORE = ("torch", "numpy", "scipy", "trimesh", "roma", "hydra", "tqdm", "safetensors", "matplotlib", "skimage")
+OPTIONAL = {
+    "open3d": "meshing",
+    "pyvista": "pictures",
+    "pygltflib": "rigged GLB export",
+    "pxr": "USD export",
+    "tensorboard": "training curves in TensorBoard",
+    "newton": "simulating new outfits",
+    "anny": "bodies of other shapes",
+}
+DISTRIBUTIONS = {"hydra": "hydra-core", "skimage": "scikit-image", "pxr": "usd-core", "open3d": "open3d-cpu"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at: ``name``, whether it is there, what was seen, and what to run when it is not."""
+
+    name: str
+    present: bool
+    seen: str
+    mend: str = ""
+    needed: bool = True
+
+
+def inspect_machine() -> list[Finding]:
+    """Looks at Python, packages, system libraries and accelerators; imports each package in its own process."""
+    version = platform.python_version()
+    findings = [Finding("python", sys.version_info >= (3, 11), version, "install Python 3.11 or newer")]
+    findings += [inspect_package(name, "core", needed=True) for name in CORE]
+    findings += [inspect_package(name, use, needed=False) for name, use in OPTIONAL.items()]
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    findings.append(
+        Finding("chromium", bool(browser), browser or "not found", "apt-get install -y chromium", needed=False)
+    )
+    return findings
+
+
+def inspect_package(name: str, use: str, needed: bool) -> Finding:
+    """Imports a package in a fresh process, so that a crash or a missing shared library is only a finding."""
+    probe = [sys.executable, "-c", f"import {name}"]
+    result = subprocess.run(probe, capture_output=True, text=True, timeout=120)
+    if result.returncode == 0:
+        try:
+            version = importlib.metadata.version(DISTRIBUTIONS.get(name, name))
+        except importlib.metadata.PackageNotFoundError:
+            version = "installed"
+        return Finding(f"{name} ({use})", True, version, needed=needed)
+    last = (result.stderr.strip().splitlines() or [f"the process died with code {result.returncode}"])[-1]
+    return Finding(f"{name} ({use})", False, last, mending_line(name, last), needed)
+
+
+def mending_line(package: str, message: str) -> str:
+    """The command that mends a failed import: a system library's package when one is named, else pip."""
+    library = re.search(r"(lib[\w.+-]+\.so[\w.]*)", message)
+    for stem, apt in APT_PACKAGES.items():
+        if library and library.group(1).startswith(stem):
+            return f"apt-get install -y {apt}"
+    return INSTALL_LINES.get(package, f"pip install {DISTRIBUTIONS.get(package, package)}")
+
+
+def accelerator() -> str:
+    """What torch would train on, in words."""
+    import torch
+
+    if torch.cuda.is_available():
+        return f"CUDA {torch.version.cuda}: {torch.cuda.get_device_name()}"
+    return f"CPU with {torch.get_num_threads()} threads"
