@@ -87,17 +87,20 @@ class ClosetAvatar(nn.Module):
         pose = interpolate(self.pose_encoder(pose_vertices), samples)
         return self.pose_decoder(torch.cat([pose, garment], dim=-1))
 
-    def forward(self, batch: Batch, samples: SurfaceSamples) -> Prediction:
+    def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
         """Predicts the dressed surface of each frame at the sampled template points.
 
         Args:
             batch: posed bodies with their outfits (its scans are not looked at).
             samples: N points on the template; any number, the same network serves all.
+            wrinkles: False leaves the pose branch out: the garment template alone, skinned by the body.
 
         Returns:
             `Prediction` with ``x = T r + p`` (CloSET 3.2), r = r^g + r^p in the body's local frame.
         """
         check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=len(self.vertices))
+        if not (wrinkles or self.config.template):
+            raise AvatarError("wrinkles: a model without explicit garment template has nothing else to predict.")
         outfits, row = batch.outfit_ids.unique(return_inverse=True)
         codes = self.codes[outfits]
         garment = self.surface_features(codes, samples)
@@ -105,7 +108,7 @@ class ClosetAvatar(nn.Module):
         if self.config.template:
             decoded = self.garment_decoder(garment)
             parts.append(Decoded(decoded.offsets[row], decoded.normals[row]))
-        if self.config.pose:
+        if self.config.pose and wrinkles:
             parts.append(self.decode_wrinkles(batch.pose_vertices, garment[row], samples))
         local = sum(parts[1:], parts[0])
 
@@ -119,7 +122,7 @@ class ClosetAvatar(nn.Module):
             normals=normals,
             offsets=offsets,
             garment_offsets=parts[0].offsets.float() * scale if self.config.template else None,
-            wrinkle_offsets=parts[-1].offsets.float() * scale if self.config.pose else None,
+            wrinkle_offsets=parts[-1].offsets.float() * scale if self.config.pose and wrinkles else None,
             codes=codes,
         )
 

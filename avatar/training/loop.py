@@ -55,7 +55,6 @@ class TrainConfig:
     warmup: int = 0  # steps over which the learning rate rises from zero
     clip: float | None = None  # largest gradient norm
     precision: Precision = Precision.fp32
-    validation_share: float = 0.1  # of the training frames, held back; never test frames
     validate_every: int = 500  # steps
     save_every: int = 500  # steps
     log_every: int = 20  # steps
@@ -66,8 +65,8 @@ class TrainConfig:
         for name in ("steps", "batch", "points", "scan_points", "validate_every", "save_every", "log_every"):
             if getattr(self, name) < 1:
                 raise AvatarError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        if self.lr <= 0 or self.code_lr <= 0 or not 0 <= self.validation_share < 1 or self.warmup < 0:
-            raise AvatarError("lr, code_lr: expected above 0; validation_share: in [0, 1); warmup: at least 0.")
+        if self.lr <= 0 or self.code_lr <= 0 or self.warmup < 0:
+            raise AvatarError("lr, code_lr: expected above 0; warmup: at least 0.")
         if (self.minutes is not None and self.minutes <= 0) or (self.clip is not None and self.clip <= 0):
             raise AvatarError(f"minutes, clip: expected above 0 or null, got {self.minutes} and {self.clip}.")
 

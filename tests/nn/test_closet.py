@@ -2,44 +2,13 @@
 
 import pytest
 import torch
+from spheres import DECODER, TEMPLATE, random_batch, small_config
 
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.nn.closet import ClosetAvatar, ClosetConfig
-from avatar.nn.decoders import DecoderConfig
-from avatar.nn.hierarchy import HierarchyConfig
+from avatar.nn.closet import ClosetAvatar
 from avatar.nn.methods import build_avatar, find_method
-from avatar.nn.pointnet2 import PointNet2Config
 from avatar.records import Batch
-from tests.nn.test_pointnet2 import sphere_template
-
-TEMPLATE = sphere_template()
-ENCODER = PointNet2Config(HierarchyConfig((40, 10), (0.5, 1.5), 6), ((8,), (8,)), ((8,), (4,)))
-DECODER = DecoderConfig(width=16, trunk=1, branch=0)
-
-
-def small_config(**switches) -> ClosetConfig:
-    return ClosetConfig(ENCODER, ENCODER, DECODER, DECODER, code_channels=6, **switches)
-
-
-def random_batch(frames: int = 3, outfits: tuple[int, ...] = (0, 1, 0)) -> Batch:
-    torch.manual_seed(1)
-    count = len(TEMPLATE.vertices)
-    transforms = torch.eye(4).repeat(frames, count, 1, 1)
-    transforms[..., :3, :3] += 0.1 * torch.randn(frames, 1, 3, 3)
-    transforms[..., :3, 3] = torch.randn(frames, 1, 3)
-    vertices = (transforms[..., :3, :3] @ TEMPLATE.vertices[:, :, None])[..., 0] + transforms[..., :3, 3]
-    scans = torch.randn(frames, 50, 3)
-    return Batch(
-        pose_vertices=vertices,
-        vertices=vertices,
-        vertex_transforms=transforms,
-        joint_transforms=transforms[:, :1],
-        scan_points=scans,
-        scan_normals=scans,
-        outfit_ids=torch.tensor(outfits[:frames]),
-        names=tuple(f"walk.{i:05d}" for i in range(frames)),
-    )
 
 
 def template_points(count: int = 200):

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-import trimesh
+from spheres import sphere_template
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
@@ -10,22 +10,8 @@ from avatar.nn.closet import FULL_GARMENT_ENCODER, ClosetConfig
 from avatar.nn.decoders import DecoderConfig, ShapeDecoder
 from avatar.nn.hierarchy import HierarchyConfig, build_levels
 from avatar.nn.pointnet2 import FeaturePropagation, PointNet2, PointNet2Config, SetAbstraction
-from avatar.records import Template
 
 SIZES = HierarchyConfig(points=(40, 10), radii=(0.5, 1.5), neighbours=6)
-
-
-def sphere_template(subdivisions: int = 2) -> Template:
-    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
-    vertices = torch.from_numpy(sphere.vertices).float()
-    return Template(
-        vertices=vertices,
-        faces=torch.from_numpy(sphere.faces).long(),
-        weights=torch.ones(len(vertices), 1),
-        joints=torch.zeros(1, 3),
-        parents=(-1,),
-        joint_names=("root",),
-    )
 
 
 def parameters(module: torch.nn.Module) -> int:

@@ -1,0 +1,139 @@
+"""`report`: one page about a run, with pictures of unseen poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from avatar.data.outfits import Outfit
+from avatar.evaluation.report import Picture, PictureRow, ReportContent, write_report
+from avatar.evaluation.scores import Scores
+from avatar.evaluation.tables import View, metric_table, outfit_table
+from avatar.export.pictures import color_bar, frame_camera, render_error, render_mesh, render_points
+from avatar.io.meshes import read_mesh
+from avatar.io.points import read_points
+from avatar.pipeline.scores import predictions_folder, read_all_scores, run_outfits
+from avatar.pipeline.surfaces import spaced_frames
+from avatar.records import Frame, PointCloud
+from avatar.training.prediction import body_batch, garment_template_cloud, outfit_index, predict, template_samples
+from avatar.training.runs import TrainedAvatar, load_run
+
+MAX_ERROR = 0.05  # metres at the hot end of the error pictures
+
+
+@dataclass
+class ReportConfig:
+    """One self-contained HTML page about a run."""
+
+    run: Path = Path("runs/closet/sample/dress/default")
+    against: tuple[Path, ...] = ()  # other runs whose scores stand in the same table, such as the static floor
+    split: str = "test"
+    frames: int = 4  # poses shown
+    data_root: Path | None = None  # where the data are now; where they were at training if null
+
+
+def report(config: ReportConfig) -> Path:
+    """Writes ``<run>/report.html``; what has not been predicted, meshed or scored is said to be missing."""
+    avatar = load_run(config.run)
+    scores = gather_scores(config, avatar)
+    rows: list[PictureRow] = []
+    for outfit in run_outfits(avatar, config.data_root):
+        names = spaced_frames(list(outfit.frames(config.split)), config.frames)
+        rows += [pose_pictures(config, avatar, outfit, name) for name in names]
+        rows += template_pictures(avatar, outfit)
+    tables = [metric_table(scores.rows, name) for name in dict.fromkeys(row.outfit for row in scores.rows)]
+    if {"sampling"} <= {row.method for row in scores.rows}:
+        tables.append(outfit_table(scores.rows, "cd_point", View.EXCESS))
+    settings = avatar.config
+    content = ReportContent(
+        title=f"{settings.method.variant} on {', '.join(settings.outfit)}",
+        subtitle=f"data set {settings.dataset}, {config.split} poses, none of which were trained on",
+        summary="Points are predicted from the posed body alone; ground truth is a scan of the simulated clothes.",
+        facts=headline_facts(avatar, scores),
+        config_yaml=(config.run / "config.yaml").read_text(),
+        metrics_csv=config.run / "metrics.csv",
+        tables=tuple(tables),
+        pictures=tuple(rows),
+        files=made_files(config.run),
+    )
+    return write_report(config.run, content)
+
+
+def gather_scores(config: ReportConfig, avatar: TrainedAvatar) -> Scores:
+    """The run's scores, those of the runs it is set against, and the floors, as far as they are there."""
+    settings = avatar.config
+    floors = [settings.runs_root / "floors" / settings.dataset / name for name in settings.outfit]
+    paths = [folder / "scores.csv" for folder in (*floors, *config.against, config.run)]
+    return read_all_scores(path for path in paths if path.is_file())
+
+
+def headline_facts(avatar: TrainedAvatar, scores: Scores) -> dict[str, str]:
+    """The numbers on top of the page."""
+    facts = {
+        "training": f"{avatar.steps} steps, {avatar.seconds / 60:.1f} min",
+        "parameters": f"{sum(p.numel() for p in avatar.model.parameters()):,}",
+    }
+    for row in scores.rows:
+        if row.metric == "cd_point":
+            facts[f"cd_point, {row.method}, {row.outfit}"] = f"{row.value * 1e4:.3f} x 1e-4 m²"
+    return facts
+
+
+def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, name: str) -> PictureRow:
+    """Ground truth, prediction, garment template, mesh and error of one unseen pose, in one framing."""
+    frame = outfit.load(config.split, name)
+    scan = frame.scan
+    camera = frame_camera(scan.points, "three_quarter")
+    pictures: list[Picture | None] = [
+        Picture(render_points(PointCloud(scan.points, scan.normals), camera), f"scan of {name}"),
+        None,
+        None,
+        None,
+        None,
+    ]
+    path = predictions_folder(config.run, config.split, outfit.name) / f"{name}.ply"
+    if path.is_file():
+        cloud = read_points(path)
+        errors = cKDTree(scan.points).query(cloud.points, workers=-1)[0]
+        hot = render_error(cloud, errors, MAX_ERROR, camera)
+        pictures[1] = Picture(render_points(cloud, camera), f"predicted points for {name}")
+        pictures[4] = Picture(
+            np.concatenate([hot, color_bar(MAX_ERROR, hot.shape[0])], axis=1),
+            f"distance of predicted points of {name} to the scan",
+            f"mean {errors.mean() * 1000:.1f} mm",
+        )
+    if getattr(avatar.model, "garment_decoder", None) is not None:
+        pictures[2] = Picture(
+            render_points(posed_template(avatar, outfit.name, frame), camera), f"garment template posed as {name}"
+        )
+    mesh = config.run / "meshes" / config.split / outfit.name / f"{name}.ply"
+    if mesh.is_file():
+        pictures[3] = Picture(render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
+    return PictureRow(f"{outfit.name}: {name}", tuple(pictures))
+
+
+def posed_template(avatar: TrainedAvatar, outfit: str, frame: Frame) -> PointCloud:
+    """The garment template alone, skinned to a frame's body."""
+    batch = body_batch([frame.body], outfit_index(avatar, outfit), (frame.name,))
+    return predict(avatar.model, batch, template_samples(avatar.template, 50_000), wrinkles=False)
+
+
+def template_pictures(avatar: TrainedAvatar, outfit: Outfit) -> list[PictureRow]:
+    """The explicit garment template in the canonical pose; no row for methods without one."""
+    if getattr(avatar.model, "garment_decoder", None) is None:
+        return []
+    cloud = garment_template_cloud(avatar, outfit.name, 50_000)
+    picture = Picture(render_points(cloud, frame_camera(cloud.points)), f"garment template of {outfit.name}")
+    return [PictureRow(f"{outfit.name}: at rest", (None, None, picture, None, None))]
+
+
+def made_files(run: Path) -> tuple[Path, ...]:
+    """What the run made: its files and, for folders of many, the folder."""
+    files = [path for path in sorted(run.iterdir()) if path.is_file() and path.name != "report.html"]
+    folders = sorted(
+        {path.parent for kind in ("predictions", "meshes", "export") for path in (run / kind).rglob("*.*")}
+    )
+    return tuple(files + folders)

@@ -1,0 +1,170 @@
+"""`predict` and `evaluate`: point clouds on disk from a run, and the table of all metrics from disk."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from avatar.checks import AvatarError
+from avatar.data.layouts import find_outfit
+from avatar.data.open_layout import OpenOutfit
+from avatar.data.outfits import Outfit
+from avatar.evaluation.floors import score_body_floor, score_sampling_floor
+from avatar.evaluation.scores import Scores, read_scores, write_scores
+from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
+from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
+from avatar.io.motions import read_motion
+from avatar.training.prediction import predict_frames, predict_motion
+from avatar.training.runs import TrainedAvatar, load_run
+
+
+@dataclass
+class PredictConfig:
+    """Posed point clouds from a trained run, for the frames of a split or for a motion file."""
+
+    run: Path = Path("runs/closet/sample/dress/default")
+    split: str = "test"
+    motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
+    fps: float = 30.0  # frames a second a motion is resampled to
+    points: int = 50000  # 1,000 to 400,000
+    checkpoint: str = "last"  # or best, on the held-back frames
+    data_root: Path | None = None  # where the data are now; where they were at training if null
+    device: str = "auto"
+
+
+@dataclass
+class EvaluateConfig:
+    """Scores of prediction folders, with the floors in the same table."""
+
+    runs: tuple[Path, ...] = (Path("runs/closet/sample/dress/default"),)
+    split: str = "test"
+    floors: bool = True  # score the sampling floor and the bare body as well
+    score: ScoreConfig = field(default_factory=ScoreConfig)
+    data_root: Path | None = None  # where the data are now; where they were at training if null
+    predictions: Path | None = None  # a foreign program's folder of <frame>.ply, instead of runs
+    method: str = "foreign"  # its name in the table
+    dataset: str = "sample"  # the data it predicts
+    outfit: str = "dress"
+    out: Path | None = None  # where the scores of foreign predictions go; beside them if null
+
+
+def predictions_folder(run: Path, name: str, outfit: str) -> Path:
+    """Where a run's predictions stand: ``<run>/predictions/<split or motion>/<outfit>``."""
+    return run / "predictions" / name / outfit
+
+
+def run_outfits(avatar: TrainedAvatar, data_root: Path | None) -> list[Outfit]:
+    """The outfits a run was trained on, where they are now or where they were then."""
+    return replace(avatar.config, data_root=data_root or avatar.config.data_root).outfits()
+
+
+def predict(config: PredictConfig) -> list[Path]:
+    """Predicts every outfit of a run; gives the folders of point clouds.
+
+    Raises:
+        AvatarError: when a motion is asked for and the body cannot be posed (packed data has no body model).
+    """
+    avatar = load_run(config.run, config.checkpoint, config.device)
+    folders = []
+    for outfit in run_outfits(avatar, config.data_root):
+        if config.motion is None:
+            folders.append(predictions_folder(config.run, config.split, outfit.name))
+            predict_frames(avatar, outfit, config.split, folders[-1], config.points)
+            continue
+        if not isinstance(outfit, OpenOutfit):
+            raise AvatarError(f"motion: {outfit.name} has no body model to pose; use split instead.")
+        motion = read_motion(config.motion, config.fps)
+        folders.append(predictions_folder(config.run, motion.name, outfit.name))
+        predict_motion(avatar, outfit, motion, folders[-1], config.points)
+    return folders
+
+
+def evaluate(config: EvaluateConfig) -> Scores:
+    """Scores runs, or a foreign program's predictions, beside their floors; prints the tables.
+
+    Each run's scores go to ``<run>/scores.csv``, the floors to ``<runs>/floors/<dataset>/<outfit>/scores.csv``.
+    """
+    if config.predictions is not None:
+        outfit = find_outfit(config.data_root or Path("data"), config.dataset, config.outfit)
+        folder = config.out or config.predictions
+        scores = score_predictions(config.predictions, outfit, config.split, config.score, Label(config.method))
+        write_scores(folder / "scores.csv", scores)
+        if config.floors:
+            scores = score_floors(outfit, config, 50_000, folder / "floors.csv") + scores
+    else:
+        scores = score_runs(config)
+    print_tables(scores)
+    return scores
+
+
+def score_runs(config: EvaluateConfig) -> Scores:
+    """Scores every outfit of every run, and the floors once an outfit."""
+    scores, seen = Scores(), set()
+    for run in config.runs:
+        avatar = load_run(run)
+        settings = avatar.config
+        label = Label(
+            settings.method.variant,
+            seed=settings.train.seed,
+            steps=avatar.steps,
+            seconds=avatar.seconds,
+            commit=current_commit(),
+        )
+        mine = Scores()
+        for outfit in run_outfits(avatar, config.data_root):
+            folder = predictions_folder(run, config.split, outfit.name)
+            mine = mine + score_predictions(folder, outfit, config.split, config.score, label)
+            if config.floors and outfit.path not in seen:
+                seen.add(outfit.path)
+                path = settings.runs_root / "floors" / settings.dataset / outfit.name / "scores.csv"
+                scores = scores + score_floors(outfit, config, mine.rows[-1].points, path)
+        write_scores(run / "scores.csv", mine)
+        scores = scores + mine
+    return scores
+
+
+def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
+    """The sampling floor and the bare body for one outfit, kept in a file for the next method.
+
+    The file serves again when it was made with the same points, metrics and seed.
+    """
+    beside = path.with_suffix(".settings.txt")
+    key = f"{config.split} {points} {config.score}"
+    if path.is_file() and beside.is_file() and beside.read_text() == key:
+        return read_scores(path)
+    commit = current_commit()
+    floors = score_sampling_floor(outfit, config.split, config.score, points, commit=commit)
+    floors = floors + score_body_floor(outfit, config.split, config.score, points, commit=commit)
+    write_scores(path, floors)
+    beside.write_text(key)
+    return floors
+
+
+def print_tables(scores: Scores) -> None:
+    """Prints every metric of every outfit, and the excess over the sampling floor where floors were scored."""
+    for outfit in dict.fromkeys(row.outfit for row in scores.rows):
+        print(to_markdown(metric_table(scores.rows, outfit)))
+    methods = {row.method for row in scores.rows}
+    if "sampling" in methods:
+        print(to_markdown(outfit_table(scores.rows, "cd_point", View.EXCESS)))
+
+
+def read_all_scores(paths: Iterable[Path]) -> Scores:
+    """Scores of several files, joined."""
+    joined = Scores()
+    for path in paths:
+        joined = joined + read_scores(path)
+    return joined
+
+
+def current_commit() -> str:
+    """The short hash of the code's commit, or nothing outside a checkout."""
+    here = Path(__file__).parent
+    command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--exclude", "*"]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return result.stdout.strip() if result.returncode == 0 else ""

@@ -1,0 +1,136 @@
+"""Posed point clouds from a trained avatar: for the frames of a split or for a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from avatar.checks import AvatarError, check_shape
+from avatar.data.open_layout import OpenOutfit
+from avatar.data.outfits import Outfit
+from avatar.geometry.surface import sample_surface
+from avatar.io.points import write_points
+from avatar.records import Batch, BodyFit, Motion, PointCloud, Prediction, SurfaceSamples, Template
+from avatar.training.runs import TrainedAvatar
+
+MAX_POINTS = 400_000
+CHUNK = 100_000  # points decoded at once; the network is pointwise, so chunks change nothing
+
+
+def template_samples(template: Template, points: int, seed: int = 0) -> SurfaceSamples:
+    """The template points a prediction is made at: spread evenly by area, fixed by the seed.
+
+    Raises:
+        AvatarError: for a count out of 1,000 to 400,000.
+    """
+    if not 1000 <= points <= MAX_POINTS:
+        raise AvatarError(f"points: expected 1,000 to {MAX_POINTS:,}, got {points}.")
+    return sample_surface(template.vertices, template.faces, points, torch.Generator().manual_seed(seed))
+
+
+def body_batch(bodies: list[BodyFit], outfit: int, names: tuple[str, ...]) -> Batch:
+    """Bodies without scans as a batch for prediction."""
+
+    def stack(field: str) -> Tensor:
+        return torch.stack([torch.as_tensor(getattr(body, field), dtype=torch.float32) for body in bodies])
+
+    nothing = torch.zeros(len(bodies), 0, 3)
+    return Batch(
+        pose_vertices=stack("pose_vertices"),
+        vertices=stack("vertices"),
+        vertex_transforms=stack("vertex_transforms"),
+        joint_transforms=stack("joint_transforms"),
+        scan_points=nothing,
+        scan_normals=nothing,
+        outfit_ids=torch.full((len(bodies),), outfit),
+        names=names,
+    )
+
+
+@torch.no_grad()
+def predict(model: torch.nn.Module, batch: Batch, samples: SurfaceSamples, **switches: bool) -> PointCloud:
+    """The dressed surface of one body (a batch of one) at any number of template points.
+
+    ``switches`` go to the network, such as CloSET's ``wrinkles=False`` for the garment template alone.
+    """
+    check_shape("vertices", batch.vertices, "1 V 3")
+    device = next(model.parameters()).device
+    batch, parts = batch.to(device), []
+    for start in range(0, len(samples.face_ids), CHUNK):
+        chunk = slice(start, start + CHUNK)
+        part = SurfaceSamples(samples.vertex_ids[chunk], samples.barycentric[chunk], samples.face_ids[chunk])
+        parts.append(model(batch, part.to(device), **switches))
+    return join_clouds(parts)
+
+
+def join_clouds(parts: list[Prediction]) -> PointCloud:
+    """Chunks of one frame's prediction as one cloud."""
+    points = torch.cat([part.points[0] for part in parts])
+    normals = torch.cat([part.normals[0] for part in parts])
+    return PointCloud(points.float().cpu().numpy(), normals.float().cpu().numpy())
+
+
+def predict_frames(
+    avatar: TrainedAvatar, outfit: Outfit, split: str, folder: Path, points: int, keep: Callable[[str], bool] = bool
+) -> list[Path]:
+    """Writes ``<folder>/<frame>.ply`` for the frames of a split; gives the files in order.
+
+    Args:
+        avatar: a trained avatar.
+        outfit: one of the outfits it was trained on.
+        split: train or test.
+        folder: where the point clouds go.
+        points: template points a frame.
+        keep: which frames, by name; all of them by default.
+    """
+    index = outfit_index(avatar, outfit.name)
+    samples = template_samples(avatar.template, points)
+    written = []
+    for name in tqdm([n for n in outfit.frames(split) if keep(n)], desc=f"predict {outfit.name}", disable=None):
+        batch = body_batch([outfit.load(split, name).body], index, (name,))
+        written.append(folder / f"{name}.ply")
+        write_points(written[-1], predict(avatar.model, batch, samples))
+    return written
+
+
+def outfit_index(avatar: TrainedAvatar, name: str) -> int:
+    """Which of the avatar's garment codes an outfit has.
+
+    Raises:
+        AvatarError: for an outfit it was not trained on, naming those it was.
+    """
+    if name not in avatar.config.outfit:
+        raise AvatarError(f"outfit: this avatar was trained on {', '.join(avatar.config.outfit)}, not on {name!r}.")
+    return avatar.config.outfit.index(name)
+
+
+def predict_motion(avatar: TrainedAvatar, outfit: OpenOutfit, motion: Motion, folder: Path, points: int) -> list[Path]:
+    """Writes ``<folder>/<motion>.<frame>.ply`` for every frame of a motion; points keep their order over time."""
+    index = outfit_index(avatar, outfit.name)
+    samples = template_samples(avatar.template, points)
+    check_shape("poses", motion.poses, "T J 3", J=len(outfit.body.parents))
+    written = []
+    for frame in tqdm(range(len(motion.poses)), desc=f"predict {motion.name}", disable=None):
+        name = f"{motion.name}.{frame:05d}"
+        body = outfit.fit_pose(motion.poses[frame], motion.translations[frame])
+        written.append(folder / f"{name}.ply")
+        write_points(written[-1], predict(avatar.model, body_batch([body], index, (name,)), samples))
+    return written
+
+
+def garment_template_cloud(avatar: TrainedAvatar, outfit: str, points: int) -> PointCloud:
+    """The explicit garment template of an outfit in the canonical pose.
+
+    Raises:
+        AvatarError: for a method without an explicit template.
+    """
+    if not hasattr(avatar.model, "garment_template"):
+        raise AvatarError(f"method: {avatar.config.method.name} has no explicit garment template.")
+    device = next(avatar.model.parameters()).device
+    samples = template_samples(avatar.template, points).to(device)
+    decoded = avatar.model.garment_template(outfit_index(avatar, outfit), samples)
+    return join_clouds([Prediction(decoded.offsets, decoded.normals, decoded.offsets)])

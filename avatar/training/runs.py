@@ -1,0 +1,193 @@
+"""A training run from its settings to its folder, and back from the folder to the trained avatar."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import nn
+
+from avatar.body.packed import read_template, write_template
+from avatar.checks import AvatarError, DataError
+from avatar.data.batches import FrameDataset, name_frames
+from avatar.data.layouts import find_outfit
+from avatar.data.outfits import SAFE_NAME, Outfit
+from avatar.data.scanner import ScanConfig
+from avatar.data.splits import SplitConfig, split_outfit
+from avatar.io.npz import write_whole
+from avatar.nn.methods import build_avatar, find_method
+from avatar.records import Batch, Template
+from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.training.checkpoints import load_checkpoint, read_weights, write_weights
+from avatar.training.loop import TrainConfig, Trainer
+
+WEIGHTS = "avatar"  # avatar.safetensors and avatar.json in the run's folder
+
+
+@dataclass
+class MethodChoice:
+    """A method by name; ``variant`` names the run's folder, ``settings`` are the method's own options."""
+
+    name: str = "closet"
+    variant: str = "closet"
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class RunConfig:
+    """One training run: what to train, on which outfits, where."""
+
+    method: MethodChoice = field(default_factory=MethodChoice)
+    dataset: str = "sample"
+    outfit: tuple[str, ...] = ("dress",)  # several train one network with a garment code each
+    name: str = "default"
+    data_root: Path = Path("data")
+    runs_root: Path = Path("runs")
+    scan: ScanConfig = field(default_factory=ScanConfig)
+    split: SplitConfig = field(default_factory=SplitConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    device: str = "auto"  # auto takes CUDA where there is one
+
+    def __post_init__(self):
+        for what, value in (("name", self.name), ("method.variant", self.method.variant)):
+            if not SAFE_NAME.fullmatch(value):
+                raise AvatarError(f"{what}: expected a plain name (letters, digits, '_', '.', '-'), got {value!r}.")
+        if not self.outfit or len(set(self.outfit)) != len(self.outfit):
+            raise AvatarError(f"outfit: expected one or more different outfits, got {self.outfit}.")
+
+    @property
+    def folder(self) -> Path:
+        """Where the run lives: ``<runs>/<variant>/<dataset>/<outfit>/<name>``."""
+        return self.runs_root / self.method.variant / self.dataset / "+".join(self.outfit) / self.name
+
+    def outfits(self) -> list[Outfit]:
+        """The run's outfits on disk."""
+        return [find_outfit(self.data_root, self.dataset, name, self.scan) for name in self.outfit]
+
+
+@dataclass(frozen=True)
+class TrainedAvatar:
+    """A trained network with what it was trained on: ``config``, the ``template`` it is built on, ``steps`` done."""
+
+    model: nn.Module
+    template: Template
+    config: RunConfig
+    steps: int
+    seconds: float
+
+
+def choose_device(name: str) -> torch.device:
+    """The device to train on; ``auto`` takes CUDA where there is one."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        return torch.zeros(0, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise AvatarError(f"device: expected auto, cpu or a CUDA device there is, got {name!r} ({reason}).") from error
+
+
+def train_run(config: RunConfig) -> Path:
+    """Trains a run, or goes on with it, and leaves its weights to share; gives the run's folder.
+
+    Raises:
+        AvatarError: for unknown names or options, and when the folder holds a run with other settings.
+    """
+    method = find_method(config.method.name)
+    settings = settings_from_dict(method.settings, config.method.settings, "method.settings.")
+    config = replace(config, method=replace(config.method, settings=settings_to_dict(settings)))
+    outfits = config.outfits()
+    template = mean_template([outfit.template for outfit in outfits])
+    splits = [split_outfit(outfit, config.split) for outfit in outfits]
+    scans, size = (config.train.scan_points, config.train.seed), config.train.batch
+    frames = FrameDataset(outfits, name_frames(outfits, "train", [s.train for s in splits]), *scans)
+    held_back = name_frames(outfits, "train", [s.validation for s in splits])
+    save_settings(config)
+
+    torch.manual_seed(config.train.seed)
+    model = build_avatar(config.method.name, template, len(outfits), settings).to(choose_device(config.device))
+    trainer = Trainer(model, template.vertices, template.faces, config.train, config.folder)
+    checks = FrameDataset(outfits, held_back, *scans) if held_back else None
+
+    def validation() -> Iterator[Batch]:
+        return checks.ordered_batches(size) if checks else iter(())
+
+    trainer.fit(lambda step: frames.batch_at(step, size), frames.epoch_length(size), validation)
+    write_template(config.folder / "template.npz", template)
+    facts = {"config": settings_to_dict(config), "steps": trainer.step, "seconds": trainer.seconds}
+    write_weights(config.folder / WEIGHTS, model.state_dict(), facts)
+    return config.folder
+
+
+def save_settings(config: RunConfig) -> None:
+    """Writes the run's ``config.yaml``, or checks that a run to go on with has the same settings.
+
+    The budget (``train.steps``, ``train.minutes``) and bookkeeping may change between the two.
+
+    Raises:
+        AvatarError: naming the options that differ.
+    """
+    path = config.folder / "config.yaml"
+    plain = settings_to_dict(config)
+    if path.is_file():
+        before = flatten(yaml.safe_load(path.read_text()))
+        now = flatten(plain)
+        free = {"train.steps", "train.minutes", "train.save_every", "train.log_every", "device", "data_root"}
+        changed = [key for key in sorted(before.keys() | now.keys()) if before.get(key) != now.get(key)]
+        changed = [key for key in changed if key not in free]
+        if changed:
+            raise AvatarError(
+                f"{path}: this run was begun with other settings ({', '.join(changed[:5])}). "
+                "Give the new one another name (name=...), or delete the folder."
+            )
+    write_whole(path, yaml.safe_dump(plain, sort_keys=False).encode())
+
+
+def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested options as ``a.b.c: value``."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def mean_template(templates: list[Template]) -> Template:
+    """The template a network is built on: the outfits' mean body where they differ in shape."""
+    first = templates[0]
+    if any(not torch.equal(template.faces, first.faces) for template in templates):
+        raise AvatarError("outfit: expected bodies of one topology in a run, got several.")
+    vertices = torch.stack([template.vertices for template in templates]).mean(dim=0)
+    joints = torch.stack([template.joints for template in templates]).mean(dim=0)
+    return replace(first, vertices=vertices, joints=joints)
+
+
+def load_run(folder: Path, checkpoint: str = "last", device: str = "auto") -> TrainedAvatar:
+    """The trained avatar of a run's folder.
+
+    Args:
+        folder: the run's folder.
+        checkpoint: ``last`` (the shared weights) or ``best`` on the held-back frames.
+        device: where to put it.
+
+    Raises:
+        DataError: when the folder is no finished run, or a file in it is damaged.
+    """
+    if checkpoint not in ("last", "best"):
+        raise AvatarError(f"checkpoint: expected last or best, got {checkpoint!r}.")
+    weights, facts = read_weights(folder / WEIGHTS)
+    config = settings_from_dict(RunConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
+    steps, seconds = facts["steps"], facts["seconds"]
+    if checkpoint == "best":
+        state = load_checkpoint(folder / "checkpoints", "best")
+        if state is None:
+            raise DataError(folder / "checkpoints", "no best checkpoint: the run held no frames back for validation.")
+        weights, steps, seconds = state["model"], state["step"], state["seconds"]
+    template = read_template(folder / "template.npz")
+    settings = settings_from_dict(find_method(config.method.name).settings, config.method.settings)
+    model = build_avatar(config.method.name, template, len(config.outfit), settings)
+    model.load_state_dict(weights)
+    return TrainedAvatar(model.to(choose_device(device)).eval(), template, config, steps, seconds)
