@@ -22,11 +22,13 @@ from avatar.nn.methods import METHODS
 from avatar.pipeline import DemoConfig, EvaluateConfig, ExportConfig, MeshConfig, PredictConfig, ReportConfig
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.simulate.recording import SimulateConfig
+from avatar.training.fitting import FitConfig
 from avatar.training.runs import RunConfig
 
 CONF = Path(__file__).parents[1] / "conf"
 VERBS = {
     "train": RunConfig,
+    "fit": FitConfig,
     "predict": PredictConfig,
     "evaluate": EvaluateConfig,
     "mesh": MeshConfig,
