@@ -14,7 +14,7 @@ from avatar.geometry.transforms import axis_angle_from_rotation, rotation_betwee
 from avatar.records import Template
 
 OPEN_TOPOLOGIES = ("notoes", "notoes_collapse10pc", "anny", "makehuman")
-MIXAMO_NAMES = (
+MIXAMO_NAMES = (  # noqa: SIM905
     "Hips LeftUpLeg RightUpLeg Spine LeftLeg RightLeg Spine1 LeftFoot RightFoot Spine2 LeftToeBase RightToeBase "
     "Neck LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand"
 ).split()
@@ -58,7 +58,7 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
     rest = model(phenotype_kwargs=values)
     labels = [label.removeprefix("mixamorig:") for label in model.bone_labels]
     weights = torch.zeros(len(rest["rest_vertices"][0]), len(SMPL_JOINTS), dtype=torch.float64)
-    for bone, label in enumerate(labels):
+    for bone in range(len(labels)):
         ancestor = bone
         while labels[ancestor] not in MIXAMO_NAMES:
             ancestor = model.bone_parents[ancestor]

@@ -7,10 +7,17 @@ from torch import Tensor, nn
 
 from avatar.body.skinning import blend_transforms, chain_transforms, check_parents
 from avatar.checks import AvatarError, check_finite, check_shape
-from avatar.geometry.transforms import invert_affine, invert_rigid, transform_points
+from avatar.geometry.transforms import (
+    assemble_transform,
+    invert_affine,
+    invert_rigid,
+    rotation_from_axis_angle,
+    transform_directions,
+    transform_points,
+)
 from avatar.records import PosedBody, Template
 
-SMPL_JOINTS = (
+SMPL_JOINTS = (  # noqa: SIM905
     "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot "
     "neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist"
 ).split()
@@ -24,7 +31,8 @@ class BodyModel(nn.Module):
     SMPL). *Zero* is the T-pose in which all pose parameters are zero, whatever the body. *Canonical* is the space
     of templates and garments: zero by default, or any other pose (legs apart, for skirts). Every transform given
     out is posed_from_canonical, and the skinned bind shape is what lies under all of them, so a body bound in an
-    A-pose keeps its good shoulders.
+    A-pose keeps its good shoulders. Vertex transforms are therefore not the joint transforms blended by the weights,
+    unless bind and canonical pose are one.
     """
 
     def __init__(
@@ -32,6 +40,7 @@ class BodyModel(nn.Module):
         bind: Template,
         zero_from_bind: Tensor | None = None,
         canonical_pose: Tensor | None = None,
+        pose_directions: Tensor | None = None,
     ):
         """Builds a body from its bind-pose template.
 
@@ -39,50 +48,46 @@ class BodyModel(nn.Module):
             bind: vertices, joints and skinning weights in the bind pose.
             zero_from_bind: ``(J, 4, 4)`` rigid motion of each joint from bind to the T-pose; identity if None.
             canonical_pose: ``(J, 3)`` axis-angle pose of the canonical space, relative to the T-pose; zero if None.
+            pose_directions: ``(V, 3, 9 (J - 1))`` pose blendshapes: displacement of the bind vertices, metres, for
+                each entry of ``R - I`` of each joint but the root (SMPL's ``posedirs``); none if None.
 
         Raises:
             AvatarError: on shapes that do not fit, non-finite values, or weights whose rows do not sum to 1.
         """
         super().__init__()
-        dims = check_shape("vertices", bind.vertices, "V 3")
-        dims = check_shape("weights", bind.weights, "V J", **dims)
-        check_shape("joints", bind.joints, "J 3", **dims)
-        check_shape("faces", bind.faces, "F 3")
-        check_parents(bind.parents)
-        if len(bind.parents) != dims["J"] or len(bind.joint_names) != dims["J"]:
-            raise AvatarError(
-                f"parents, joint_names: expected {dims['J']}, got {len(bind.parents)} and {len(bind.joint_names)}."
-            )
-        for name in ("vertices", "weights", "joints"):
-            check_finite(name, getattr(bind, name))
-        off = (bind.weights.sum(dim=-1) - 1).abs().max()
-        if off > 1e-3:
-            raise AvatarError(f"weights: expected rows summing to 1, got a row off by {float(off):.3g}.")
-        if int(bind.faces.min()) < 0 or int(bind.faces.max()) >= dims["V"]:
-            raise AvatarError(f"faces: expected indices in [0, {dims['V']}), got {int(bind.faces.max())}.")
+        dims = check_bind(bind)
+        like, joints = bind.vertices, dims["J"]
+        if zero_from_bind is None:
+            zero_from_bind = torch.eye(4, dtype=like.dtype, device=like.device).expand(joints, 4, 4)
+        if canonical_pose is None:
+            canonical_pose = like.new_zeros(joints, 3)
+        check_shape("zero_from_bind", zero_from_bind, "J 4 4", J=joints)
+        check_shape("canonical_pose", canonical_pose, "J 3", J=joints)
+        if pose_directions is not None:
+            check_shape("pose_directions", pose_directions, "V 3 P", V=dims["V"], P=9 * (joints - 1))
+            check_finite("pose_directions", pose_directions)
+            pose_directions = pose_directions.clone()
 
         self.parents, self.joint_names = tuple(bind.parents), tuple(bind.joint_names)
-        if zero_from_bind is None:
-            zero_from_bind = torch.eye(4, dtype=bind.vertices.dtype).expand(dims["J"], 4, 4)
-        if canonical_pose is None:
-            canonical_pose = torch.zeros(dims["J"], 3, dtype=bind.vertices.dtype)
-        check_shape("zero_from_bind", zero_from_bind, "J 4 4", J=dims["J"])
-        check_shape("canonical_pose", canonical_pose, "J 3", J=dims["J"])
-
+        self.register_buffer("pose_directions", pose_directions, persistent=False)
+        canonical_pose = canonical_pose.to(like)
         zero_joints = transform_points(zero_from_bind, bind.joints)
         canonical_from_zero = chain_transforms(canonical_pose[None], zero_joints, self.parents)[0]
         canonical_from_bind = canonical_from_zero @ zero_from_bind
         vertex_canonical_from_bind = blend_transforms(bind.weights, canonical_from_bind)
+        corrected = bind.vertices + self.pose_displacements(canonical_pose[None])[0]
         for name, value in {
             "faces": bind.faces,
             "weights": bind.weights,
             "canonical_pose": canonical_pose,
             "bind_vertices": bind.vertices,
+            "bind_joints": bind.joints,
             "zero_joints": zero_joints,
             "zero_from_bind": zero_from_bind,
             "zero_from_canonical": invert_rigid(canonical_from_zero),
             "vertex_bind_from_canonical": invert_affine(vertex_canonical_from_bind),
-            "canonical_vertices": transform_points(vertex_canonical_from_bind, bind.vertices),
+            "corrected_bind_vertices": corrected,
+            "canonical_vertices": transform_points(vertex_canonical_from_bind, corrected),
             "canonical_joints": transform_points(canonical_from_bind, bind.joints),
         }.items():
             self.register_buffer(name, value.clone(), persistent=False)
@@ -94,8 +99,27 @@ class BodyModel(nn.Module):
             self.canonical_vertices, self.faces, self.weights, self.canonical_joints, self.parents, self.joint_names
         )
 
+    def with_canonical_pose(self, canonical_pose: Tensor) -> BodyModel:
+        """The same body with another canonical space, ``(J, 3)`` axis-angle relative to the T-pose."""
+        bind = Template(self.bind_vertices, self.faces, self.weights, self.bind_joints, self.parents, self.joint_names)
+        return BodyModel(bind, self.zero_from_bind, canonical_pose, self.pose_directions)
+
+    def pose_displacements(self, pose: Tensor) -> Tensor:
+        """Pose-dependent displacement of the bind vertices, metres: ``(B, J, 3)`` to ``(B, V, 3)``.
+
+        Zero ``(B, 1, 1)`` for a body without pose blendshapes.
+        """
+        if self.pose_directions is None:
+            return pose.new_zeros(len(pose), 1, 1)
+        rotations = rotation_from_axis_angle(pose[:, 1:])
+        features = (rotations - torch.eye(3, dtype=pose.dtype, device=pose.device)).flatten(1)
+        return (features @ self.pose_directions.flatten(0, 1).T).unflatten(-1, (-1, 3))
+
     def forward(self, pose: Tensor, translation: Tensor | None = None) -> PosedBody:
         """Poses the body.
+
+        A vertex transform carries the canonical vertex to its posed place, pose blendshapes included: what they
+        add since the canonical pose lies in its translation.
 
         Args:
             pose: ``(B, J, 3)`` axis-angle, radians, relative to the parent and to the T-pose.
@@ -112,8 +136,45 @@ class BodyModel(nn.Module):
             shift[..., :3, 3] = translation[:, None]
             posed_from_zero = posed_from_zero + shift
         posed_from_bind = blend_transforms(self.weights, posed_from_zero @ self.zero_from_bind)
+        vertex_transforms = posed_from_bind @ self.vertex_bind_from_canonical
+        vertices = self.bind_vertices
+        if self.pose_directions is not None:
+            vertices = self.bind_vertices + self.pose_displacements(pose)
+            added = transform_directions(posed_from_bind, vertices - self.corrected_bind_vertices)
+            vertex_transforms = assemble_transform(
+                vertex_transforms[..., :3, :3], vertex_transforms[..., :3, 3] + added
+            )
         return PosedBody(
-            vertices=transform_points(posed_from_bind, self.bind_vertices),
+            vertices=transform_points(posed_from_bind, vertices),
             joint_transforms=posed_from_zero @ self.zero_from_canonical,
-            vertex_transforms=posed_from_bind @ self.vertex_bind_from_canonical,
+            vertex_transforms=vertex_transforms,
         )
+
+
+def check_bind(bind: Template) -> dict[str, int]:
+    """Refuses a template that cannot be posed, and returns its sizes V and J.
+
+    Raises:
+        AvatarError: naming the field, what was expected and what came.
+    """
+    dims = check_shape("vertices", bind.vertices, "V 3")
+    dims = check_shape("weights", bind.weights, "V J", **dims)
+    check_shape("joints", bind.joints, "J 3", **dims)
+    check_shape("faces", bind.faces, "F 3")
+    check_parents(bind.parents)
+    for name, entries in (("parents", bind.parents), ("joint_names", bind.joint_names)):
+        if len(entries) != dims["J"]:
+            raise AvatarError(
+                f"{name}: expected {dims['J']} entries, as many as weights has columns, got {len(entries)}."
+            )
+    for name in ("vertices", "weights", "joints"):
+        check_finite(name, getattr(bind, name))
+    off = float((bind.weights.sum(dim=-1) - 1).abs().max())
+    if off > 1e-3 or float(bind.weights.min()) < -1e-6:
+        raise AvatarError(f"weights: expected no negative value and rows summing to 1, got a row off by {off:.3g}.")
+    if bind.faces.numel() == 0:
+        raise AvatarError("faces: expected at least one triangle, got none.")
+    lowest, highest = int(bind.faces.min()), int(bind.faces.max())
+    if lowest < 0 or highest >= dims["V"]:
+        raise AvatarError(f"faces: expected indices in [0, {dims['V']}), got {lowest} to {highest}.")
+    return dims

@@ -1,0 +1,172 @@
+"""Bodies from a template file: vertices, faces, skinning weights and a kinematic tree, without any body model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from avatar.body.model import BodyModel, check_bind
+from avatar.body.skinning import check_parents
+from avatar.checks import AvatarError, DataError, check_shape
+from avatar.io.npz import read_arrays, write_arrays
+from avatar.records import Template
+
+REQUIRED_KEYS = {"vertices": "float V 3", "faces": "int F 3", "parents": "int J", "joint_names": "text J"}
+BIND_KEYS = {"bind_vertices": "float V 3", "bind_joints": "float J 3", "zero_from_bind": "float J 4 4"}
+OPTIONAL_KEYS = {
+    "weights": "float V J",
+    "weight_joints": "int V K",
+    "weight_values": "number V K",
+    "joints": "float J 3",
+    **BIND_KEYS,
+}
+
+
+def sparse_weights(weights: np.ndarray, most: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Skinning weights ``(V, J)`` as joint indices and values ``(V, K)``, largest first, rows summing to 1.
+
+    Args:
+        weights: dense skinning weights.
+        most: influences to keep a vertex; None keeps all that are not zero, which loses nothing.
+    """
+    check_shape("weights", weights, "V J")
+    count = int((weights > 0).sum(axis=1).max())
+    ids = np.argsort(-weights, axis=1, kind="stable")[:, : min(count, most or count)]
+    values = np.take_along_axis(weights, ids, axis=1)
+    return ids.astype(np.uint16), (values / values.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def dense_weights(ids: np.ndarray, values: np.ndarray, joints: int) -> np.ndarray:
+    """Skinning weights ``(V, J)`` float32 from `sparse_weights`, or from integers in proportion to the weights.
+
+    Raises:
+        AvatarError: for a joint index out of range, a negative value, or a vertex without any weight.
+    """
+    dims = check_shape("weight_joints", ids, "V K")
+    check_shape("weight_values", values, "V K", **dims)
+    ids, values = ids.astype(np.int64), values.astype(np.float32)
+    if ids.size == 0 or ids.min() < 0 or ids.max() >= joints:
+        raise AvatarError(f"weight_joints: expected indices of {joints} joints, got others.")
+    totals = values.sum(axis=1, keepdims=True)
+    if values.min() < 0 or totals.min() <= 0:
+        raise AvatarError("weight_values: expected no negative value and at least one positive a vertex.")
+    weights = np.zeros((len(ids), joints), np.float32)
+    np.add.at(weights, (np.arange(len(ids))[:, None], ids), values / totals)
+    return weights
+
+
+def joint_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
+    """Joint positions ``(J, 3)`` estimated from the skinning weights alone.
+
+    A joint sits where its subtree meets the rest of the body: vertices are averaged by ``s (1 - s)``, s being the
+    sum of their weights over the subtree. The root has no such border and sits amid its children.
+
+    Raises:
+        AvatarError: for parents that are no tree, or naming the joint whose subtree shares no vertex with the rest.
+    """
+    check_parents(parents)
+    check_shape("weights", weights, "V J", V=len(vertices), J=len(parents))
+    subtree = weights.astype(np.float64)
+    for joint in range(len(parents) - 1, 0, -1):
+        subtree[:, parents[joint]] += subtree[:, joint]
+    border = subtree * np.clip(1 - subtree, 0, None)
+    totals = border.sum(axis=0)
+    alone = [joint for joint in range(1, len(parents)) if totals[joint] < 1e-6]
+    if alone:
+        raise AvatarError(f"joints: joint {alone[0]} shares no vertex with its parent; store `joints (J, 3)` as well.")
+    joints = border.T @ vertices / np.maximum(totals, 1e-12)[:, None]
+    children = [joint for joint, parent in enumerate(parents) if parent == 0]
+    joints[0] = joints[children].mean(axis=0) if children else vertices.mean(axis=0)
+    return joints.astype(vertices.dtype)
+
+
+def write_template(path: Path, template: Template) -> None:
+    """Writes a body at rest as a ``template.npz``: sparse weights without loss, and joint positions."""
+    write_arrays(path, _template_arrays(template))
+
+
+def read_template(path: Path) -> Template:
+    """The body at rest that a ``template.npz`` holds, float32; file and errors as in `packed_body`."""
+    arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
+    try:
+        template = _template(arrays, arrays["vertices"], arrays.get("joints"))
+        check_bind(template)
+    except AvatarError as error:
+        raise DataError(path, str(error)) from error
+    return template
+
+
+def write_body(path: Path, body: BodyModel) -> None:
+    """Writes a body as a ``template.npz`` that `packed_body` poses exactly as it was.
+
+    Beside the T-pose it keeps the pose in which the skinning weights were painted. `write_template` does not, and
+    plain skinning of its T-pose puts some of the open body's vertices a centimetre elsewhere.
+
+    Raises:
+        AvatarError: for a body with pose blendshapes, which this file has no place for.
+    """
+    if body.pose_directions is not None:
+        raise AvatarError("body: expected one without pose blendshapes; keep its own file beside the dataset instead.")
+    at_rest = body.with_canonical_pose(torch.zeros_like(body.canonical_pose)).template
+    write_arrays(path, {**_template_arrays(at_rest), **{key: getattr(body, key).cpu().numpy() for key in BIND_KEYS}})
+
+
+def packed_body(path: Path) -> BodyModel:
+    """The body of a dataset's ``template.npz``, float32.
+
+    The file holds ``vertices (V, 3)`` in the T-pose, ``faces (F, 3)``, ``parents (J,)``, ``joint_names (J,)``, the
+    skinning weights as ``weights (V, J)`` or as ``weight_joints (V, K)`` and ``weight_values (V, K)``, and maybe
+    ``joints (J, 3)``, which are estimated from the weights where they are missing. A body whose weights were painted
+    in another pose has ``bind_vertices``, ``bind_joints`` and ``zero_from_bind (J, 4, 4)`` as well.
+
+    Raises:
+        DataError: for a missing or damaged file, missing keys, or arrays that do not make a body.
+    """
+    arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
+    bound = [key for key in BIND_KEYS if key in arrays]
+    try:
+        if not bound:
+            return BodyModel(_template(arrays, arrays["vertices"], arrays.get("joints")))
+        if len(bound) < len(BIND_KEYS):
+            raise AvatarError(f"bind pose: expected all of {', '.join(BIND_KEYS)} or none, got {', '.join(bound)}.")
+        bind = _template(arrays, arrays["bind_vertices"], arrays["bind_joints"])
+        return BodyModel(bind, torch.from_numpy(arrays["zero_from_bind"].astype(np.float32)))
+    except AvatarError as error:
+        raise DataError(path, str(error)) from error
+
+
+def _template_arrays(template: Template) -> dict[str, np.ndarray]:
+    """A template as the arrays of its file."""
+    ids, values = sparse_weights(template.weights.cpu().numpy())
+    return {
+        "vertices": template.vertices.cpu().numpy(),
+        "faces": template.faces.cpu().numpy().astype(np.int32),
+        "weight_joints": ids,
+        "weight_values": values,
+        "joints": template.joints.cpu().numpy(),
+        "parents": np.array(template.parents, np.int32),
+        "joint_names": np.array(template.joint_names),
+    }
+
+
+def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.ndarray | None) -> Template:
+    """A template of a file's arrays, with the vertices and joints of one of its poses."""
+    parents = tuple(int(parent) for parent in arrays["parents"])
+    if "weights" in arrays:
+        weights = arrays["weights"].astype(np.float32)
+    elif "weight_joints" in arrays and "weight_values" in arrays:
+        weights = dense_weights(arrays["weight_joints"], arrays["weight_values"], len(parents))
+    else:
+        raise AvatarError("weights: expected `weights`, or `weight_joints` and `weight_values`, got neither.")
+    if joints is None:
+        joints = joint_positions(vertices, weights, parents)
+    return Template(
+        vertices=torch.from_numpy(vertices.astype(np.float32)),
+        faces=torch.from_numpy(arrays["faces"].astype(np.int64)),
+        weights=torch.from_numpy(weights),
+        joints=torch.from_numpy(joints.astype(np.float32)),
+        parents=parents,
+        joint_names=tuple(str(name) for name in arrays["joint_names"]),
+    )

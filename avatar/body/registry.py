@@ -1,0 +1,87 @@
+"""Bodies and canonical poses by name: what a configuration may ask for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from avatar.body.anny import Phenotype, anny_body
+from avatar.body.model import BodyModel
+from avatar.body.open import open_body
+from avatar.body.packed import packed_body
+from avatar.body.smpl import DOWNLOAD_PAGES, smpl_body, way_to_file
+from avatar.checks import AvatarError
+
+CANONICAL_POSES = {"t": 0.0, "apart": 25.0}  # degrees by which each hip is turned outwards
+
+
+@dataclass
+class BodyConfig:
+    """Which body, in which shape, with which canonical pose."""
+
+    name: str = "open"  # open, anny, smpl, smplh, smplx or packed
+    shape: str = "female"  # open: one of the asset's shapes, or mean
+    phenotype: Phenotype = field(default_factory=Phenotype)  # anny: shape parameters, each in [0, 1]
+    path: str = ""  # smpl, smplh, smplx: file from tools/convert_body.py; packed: template.npz
+    betas: list[float] = field(default_factory=list)  # smpl, smplh, smplx: shape, standard deviations
+    all_joints: bool = False  # smpl, smplh, smplx: keep hand and face joints instead of the 22 of the body
+    canonical: str = "t"  # t, or apart (hips 25 degrees outwards, for skirts)
+
+    def __post_init__(self):
+        if self.name not in BODIES:
+            raise AvatarError(f"body.name: expected one of {', '.join(BODIES)}, got {self.name!r}.")
+        if self.canonical not in CANONICAL_POSES:
+            known = ", ".join(CANONICAL_POSES)
+            raise AvatarError(f"body.canonical: expected one of {known}, got {self.canonical!r}.")
+        if self.name == "packed" and not self.path:
+            raise AvatarError("body.path: expected the template.npz of a dataset's outfit, got none.")
+        if self.name in DOWNLOAD_PAGES and not self.path:
+            raise AvatarError(f"body.path: expected a {self.name} file, got none. {way_to_file(self.name)}")
+
+
+def load_body(config: BodyConfig) -> BodyModel:
+    """The body a configuration names, float32.
+
+    Raises:
+        AvatarError: for a shape or a setting that does not exist, naming those that do.
+        DataError: for a missing or damaged file, with the way to a good one.
+    """
+    body = BODIES[config.name](config)
+    return body.with_canonical_pose(canonical_pose(config.canonical, body.joint_names))
+
+
+def canonical_pose(name: str, joint_names: Sequence[str]) -> Tensor:
+    """A canonical pose by name, ``(J, 3)`` axis-angle: ``t``, or ``apart`` with both hips turned outwards.
+
+    Raises:
+        AvatarError: for an unknown name, or a body without the joints it needs.
+    """
+    if name not in CANONICAL_POSES:
+        raise AvatarError(f"canonical pose: expected one of {', '.join(CANONICAL_POSES)}, got {name!r}.")
+    pose = torch.zeros(len(joint_names), 3)
+    if CANONICAL_POSES[name]:
+        for joint, outwards in (("left_hip", 1), ("right_hip", -1)):
+            if joint not in joint_names:
+                raise AvatarError(f"canonical pose {name!r}: expected a joint {joint}, got {', '.join(joint_names)}.")
+            pose[list(joint_names).index(joint), 2] = outwards * math.radians(CANONICAL_POSES[name])
+    return pose
+
+
+def _smpl(config: BodyConfig) -> BodyModel:
+    """A body of the SMPL family."""
+    return smpl_body(Path(config.path), config.betas, config.all_joints, kind=config.name)
+
+
+BODIES = {
+    "open": lambda config: open_body(config.shape),
+    "anny": lambda config: anny_body(config.phenotype),
+    "smpl": _smpl,
+    "smplh": _smpl,
+    "smplx": _smpl,
+    "packed": lambda config: packed_body(Path(config.path)),
+}

@@ -1,0 +1,149 @@
+"""SMPL, SMPL-H and SMPL-X from the plain npz files that `avatar.body.convert` writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
+from avatar.checks import AvatarError, DataError
+from avatar.io.npz import read_arrays
+from avatar.records import Template
+
+WRISTS = {"left": SMPL_JOINTS.index("left_wrist"), "right": SMPL_JOINTS.index("right_wrist")}
+HEAD = SMPL_JOINTS.index("head")
+FINGERS = ("index", "middle", "pinky", "ring", "thumb")
+FACE = dict.fromkeys(("jaw", "left_eye", "right_eye"), HEAD)
+DOWNLOAD_PAGES = {
+    "smpl": "https://smpl.is.tue.mpg.de",
+    "smplh": "https://mano.is.tue.mpg.de",
+    "smplx": "https://smpl-x.is.tue.mpg.de",
+}
+REQUIRED_KEYS = {
+    "kind": "text 1",
+    "v_template": "float V 3",
+    "shapedirs": "float V 3 B",
+    "J_regressor": "float J V",
+    "weights": "float V J",
+    "faces": "int F 3",
+    "parents": "int J",
+    "joint_names": "text J",
+}
+OPTIONAL_KEYS = {"posedirs": "float V 3 P"}
+
+
+def _hands(first: int) -> dict[str, int]:
+    """Finger joints of both hands and their parents, the first being joint number ``first``."""
+    joints: dict[str, int] = {}
+    for side, wrist in WRISTS.items():
+        for finger in FINGERS:
+            for knuckle in (1, 2, 3):
+                number = first + len(joints)
+                joints[f"{side}_{finger}{knuckle}"] = wrist if knuckle == 1 else number - 1
+    return joints
+
+
+EXTRA_JOINTS = {
+    "smpl": {f"{side}_hand": wrist for side, wrist in WRISTS.items()},
+    "smplh": _hands(22),
+    "smplx": {**FACE, **_hands(25)},
+}
+
+
+def joint_tree(kind: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Names and parents of all joints of a kind of model: 24 for smpl, 52 for smplh, 55 for smplx.
+
+    The first 22 are the body joints that every body has.
+    """
+    extra = EXTRA_JOINTS[kind]
+    return (*SMPL_JOINTS, *extra), (*SMPL_PARENTS, *extra.values())
+
+
+def smpl_body(
+    path: Path,
+    betas: Sequence[float] = (),
+    all_joints: bool = False,
+    canonical_pose: Tensor | None = None,
+    kind: str | None = None,
+) -> BodyModel:
+    """A body of the SMPL family in one shape, float32, with pose blendshapes where the file has them.
+
+    Args:
+        path: a file written by tools/convert_body.py.
+        betas: shape coefficients in standard deviations, as many as one likes up to those of the file.
+        all_joints: whether to keep hand and face joints. Otherwise their skinning weights go to wrists and head,
+            which is exactly the model with fingers and face in their zero pose.
+        canonical_pose: ``(J, 3)`` axis-angle pose of the canonical space; the T-pose if None.
+        kind: what the file must hold (smpl, smplh, smplx); any if None.
+
+    Raises:
+        DataError: for a missing or damaged file or one of another kind, with the way to a good one.
+        AvatarError: for more betas than the file has.
+    """
+    model = _read_model(path, kind)
+    components = model["shapedirs"].shape[-1]
+    if len(betas) > components:
+        raise AvatarError(f"betas: expected at most {components} numbers for {path}, got {len(betas)}.")
+    shape = model["shapedirs"][..., : len(betas)] @ np.asarray(betas, np.float64)
+    vertices = model["v_template"] + shape
+    joints, weights, posedirs = model["J_regressor"] @ vertices, model["weights"], model.get("posedirs")
+    parents, names = tuple(int(p) for p in model["parents"]), tuple(str(n) for n in model["joint_names"])
+    if not all_joints:
+        count = len(SMPL_JOINTS)
+        weights, joints = merge_weights(weights, parents, count), joints[:count]
+        parents, names = parents[:count], names[:count]
+        posedirs = None if posedirs is None else posedirs[..., : 9 * (count - 1)]
+    bind = Template(
+        vertices=_float32(vertices),
+        faces=torch.from_numpy(model["faces"].astype(np.int64)),
+        weights=_float32(weights / weights.sum(axis=1, keepdims=True)),
+        joints=_float32(joints),
+        parents=parents,
+        joint_names=names,
+    )
+    try:
+        return BodyModel(bind, None, canonical_pose, None if posedirs is None else _float32(posedirs))
+    except AvatarError as error:
+        raise DataError(path, str(error)) from error
+
+
+def merge_weights(weights: np.ndarray, parents: Sequence[int], count: int) -> np.ndarray:
+    """Skinning weights ``(V, J)`` of the first ``count`` joints, each later one's added to its nearest ancestor."""
+    merged = weights.copy()
+    for joint in range(len(parents) - 1, count - 1, -1):
+        merged[:, parents[joint]] += merged[:, joint]
+    return merged[:, :count]
+
+
+def way_to_file(kind: str, path: str = "<file.npz>") -> str:
+    """Where a model is to be had, and the command that makes our file of it."""
+    return (
+        f"Download the {kind} model from {DOWNLOAD_PAGES[kind]} (its licence applies), then run: "
+        f"python tools/convert_body.py <downloaded file> {path}"
+    )
+
+
+def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
+    """The arrays of a converted model, or an error that says how to come by one."""
+    mend = way_to_file(kind or "smplx", str(path))
+    if not Path(path).is_file():
+        raise DataError(path, f"expected a converted {kind or 'SMPL-family'} body model, there is no such file.", mend)
+    try:
+        model = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
+    except DataError as error:
+        raise DataError(path, str(error).removeprefix(f"{path}: "), mend) from error
+    stored = str(model["kind"][0])
+    if kind not in (None, stored):
+        raise DataError(path, f"expected a {kind} body model, got {stored}.", mend)
+    if stored not in EXTRA_JOINTS or tuple(model["parents"]) != joint_tree(stored)[1]:
+        raise DataError(path, f"expected the joints of smpl, smplh or smplx, got {stored} with others.", mend)
+    return model
+
+
+def _float32(array: np.ndarray) -> Tensor:
+    """A float32 tensor of an array."""
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

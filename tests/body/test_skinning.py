@@ -1,0 +1,62 @@
+"""Linear blend skinning in closed form and its inverse."""
+
+import pytest
+import torch
+from bodies import random_bind, random_pose
+
+from avatar.body.skinning import blend_transforms, chain_transforms, check_parents, pose_points, unpose_points
+from avatar.checks import AvatarError
+from avatar.geometry.transforms import rotation_from_axis_angle, transform_points
+
+
+def transforms(batch: int = 3) -> torch.Tensor:
+    bind = random_bind()
+    return chain_transforms(random_pose(batch, 5), bind.joints, bind.parents)
+
+
+def test_one_bone_turns_about_its_joint():
+    joint, pose = torch.tensor([[1.0, 2, 3]], dtype=torch.float64), random_pose(1, 1)
+    motion = chain_transforms(pose, joint, (-1,))[0, 0]
+    point = torch.tensor([4.0, -1, 2], dtype=torch.float64)
+    expected = rotation_from_axis_angle(pose[0, 0]) @ (point - joint[0]) + joint[0]
+    torch.testing.assert_close(transform_points(motion, point), expected)
+    torch.testing.assert_close(transform_points(motion, joint[0]), joint[0])
+
+
+def test_children_follow_their_parents_rigidly():
+    """With a still child joint, child and parent move as one."""
+    joints, pose = random_pose(3, seed=1), random_pose(1, 3)
+    pose[:, 2] = 0
+    moved = chain_transforms(pose, joints, (-1, 0, 1))
+    torch.testing.assert_close(moved[:, 2], moved[:, 1])
+    torch.testing.assert_close(transform_points(moved[0, 1], joints[1]), transform_points(moved[0, 0], joints[1]))
+
+
+def test_blend_of_one_hot_weights_is_the_joint():
+    motion = transforms()
+    torch.testing.assert_close(blend_transforms(torch.eye(5, dtype=torch.float64), motion), motion)
+    bottom = blend_transforms(random_bind().weights, motion)[..., 3, :]
+    torch.testing.assert_close(bottom, torch.tensor([0.0, 0, 0, 1]).double().expand_as(bottom))
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_unpose_undoes_pose(batched):
+    bind, motion = random_bind(), transforms()
+    weights = bind.weights.expand(3, -1, -1) if batched else bind.weights
+    points = random_pose(3, 40, seed=4) if batched else bind.vertices
+    posed = pose_points(points, weights, motion)
+    assert posed.shape == (3, 40, 3)
+    torch.testing.assert_close(unpose_points(posed, weights, motion), points.expand(3, -1, -1), atol=1e-8, rtol=0)
+
+
+def test_gradients_of_pose_and_unpose():
+    bind = random_bind()
+    arguments = (bind.vertices[:3], bind.weights[:3].clone().requires_grad_(), transforms(1).requires_grad_())
+    assert torch.autograd.gradcheck(pose_points, arguments)
+    assert torch.autograd.gradcheck(unpose_points, (bind.vertices[None, :3], *arguments[1:]))
+
+
+@pytest.mark.parametrize("parents", [(), (0,), (-1, 1), (-1, -1), (-1, 2, 0)])
+def test_trees_out_of_order_are_refused(parents):
+    with pytest.raises(AvatarError, match="parents: expected -1 first"):
+        check_parents(parents)
