@@ -21,7 +21,10 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Indices of the k nearest points to each query, nearest first.
 
     Exact on every device: distances are sums of squared differences, never the expanded product form, which
-    picks a wrong neighbour for near ties.
+    picks a wrong neighbour for near ties. Among points at the same distance any may come, the same each time.
+
+    Coordinates that are not finite are refused on the CPU. On CUDA looking for them would stall the stream, so
+    they pass through: the indices stay in range and the distances taken with them are NaN, for the loss to show.
 
     Args:
         queries: ``(B, N, 3)``.
@@ -32,22 +35,23 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
         ``(B, N, k)`` int64.
 
     Raises:
-        AvatarError: on wrong shapes, non-finite coordinates (CPU) or fewer than k points.
+        AvatarError: on wrong shapes, non-finite coordinates (CPU), k below 1 or fewer than k points.
     """
     dims = check_shape("queries", queries, "B N 3")
     dims = check_shape("points", points, "B M 3", B=dims["B"])
-    if dims["M"] < k:
-        raise AvatarError(f"points: expected at least k={k} points, got {dims['M']}.")
+    if not 1 <= k <= dims["M"]:
+        raise AvatarError(f"k, points: expected k of at least 1 and k={k} points or more, got {dims['M']} points.")
     if queries.is_cuda:
         return torch.stack([_k_nearest_chunked(q, p, k) for q, p in zip(queries, points)])
     found = []
-    for query, cloud in zip(queries.detach().numpy(), points.detach().numpy()):
+    for query, cloud in zip(queries.double().cpu().numpy(), points.double().cpu().numpy()):
         try:
-            _, ids = cKDTree(cloud, balanced_tree=False).query(query, k=k, workers=-1)
+            tree = cKDTree(cloud, balanced_tree=False)
+            _, ids = tree.query(query, k=k, workers=torch.get_num_threads())
         except ValueError as error:
             raise AvatarError(f"queries, points: expected finite coordinates ({error}).") from error
         found.append(torch.from_numpy(ids).reshape(len(query), k))
-    return torch.stack(found).long()
+    return torch.stack(found).long().to(queries.device)
 
 
 def _k_nearest_chunked(queries: Tensor, points: Tensor, k: int) -> Tensor:

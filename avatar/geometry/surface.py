@@ -10,7 +10,7 @@ from avatar.records import SurfaceSamples
 
 
 def face_cross_products(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Twice the area-weighted normal of each face. ``(..., V, 3)`` and ``(F, 3)`` to ``(..., F, 3)``."""
+    """Normal of each face, as long as twice its area. ``(..., V, 3)`` and ``(F, 3)`` to ``(..., F, 3)``."""
     check_shape("vertices", vertices, "... V 3")
     check_shape("faces", faces, "F 3")
     a, b, c = (vertices[..., faces[:, corner], :] for corner in range(3))
@@ -50,11 +50,13 @@ def sample_surface(vertices: Tensor, faces: Tensor, count: int, generator: torch
     if count < 1:
         raise AvatarError(f"count: expected at least 1 point, got {count}.")
     areas = face_areas(vertices, faces).double().cpu()
+    total = float(areas.sum())
+    if not 0 < total < torch.inf:
+        raise AvatarError(f"vertices: expected a surface with area, got a total of {total} m^2.")
     cumulative = areas.cumsum(0)
-    if not torch.isfinite(cumulative[-1]) or cumulative[-1] <= 0:
-        raise AvatarError(f"vertices: expected a surface with area, got a total of {float(cumulative[-1])} m^2.")
     strata = (torch.arange(count) + torch.rand(count, generator=generator, dtype=torch.float64)) / count
-    face_ids = torch.searchsorted(cumulative, strata * cumulative[-1]).clamp(max=len(faces) - 1)
+    # right=True never stops at a face without area, nor does the clamp against rounding at the far end
+    face_ids = torch.searchsorted(cumulative, strata * cumulative[-1], right=True).clamp(max=int(areas.nonzero()[-1]))
     root, along = torch.rand(2, count, generator=generator, dtype=torch.float64)
     root = root.sqrt()
     barycentric = torch.stack([1 - root, root * (1 - along), root * along], dim=-1)

@@ -6,7 +6,7 @@ import roma
 import torch
 from torch import Tensor
 
-from avatar.checks import check_shape
+from avatar.checks import AvatarError, check_shape
 
 
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
@@ -53,10 +53,23 @@ def invert_affine(transforms: Tensor) -> Tensor:
 
 
 def rotation_between(source: Tensor, target: Tensor) -> Tensor:
-    """The smallest rotation that turns one direction onto another. ``(3,)`` each, to ``(3, 3)``."""
+    """The smallest rotation that turns one direction onto another. ``(3,)`` each, to ``(3, 3)``.
+
+    Opposite directions have many such half turns: the one about a perpendicular nearest a coordinate axis is given.
+    Worked out in float64, so that directions a hair from parallel keep their axis.
+
+    Raises:
+        AvatarError: for a direction of no length.
+    """
+    check_shape("source", source, "3")
+    check_shape("target", target, "3")
+    dtype = source.dtype
+    source, target = source.double(), target.double()
+    if min(source.norm(), target.norm()) == 0:
+        raise AvatarError("source, target: expected two directions, got a zero vector.")
     source, target = source / source.norm(), target / target.norm()
     axis = torch.linalg.cross(source, target)
     angle = torch.atan2(axis.norm(), source @ target)
-    if axis.norm() < 1e-12:
-        return torch.eye(3, dtype=source.dtype, device=source.device)
-    return rotation_from_axis_angle(axis / axis.norm() * angle)
+    if axis.norm() < 1e-8:  # (anti)parallel: the cross product no longer tells the axis
+        axis = torch.linalg.cross(source, torch.eye(3, dtype=source.dtype, device=source.device)[source.abs().argmin()])
+    return rotation_from_axis_angle(axis / axis.norm() * angle).to(dtype)
