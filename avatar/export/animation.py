@@ -1,0 +1,168 @@
+"""Moving points, meshes and pictures for other programs: USD caches, animated GIF and WebP."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
+from avatar.export.drawing import disc_radii
+from avatar.io.meshes import check_mesh
+from avatar.io.npz import write_whole
+from avatar.records import Mesh, PointCloud
+
+USD_FORMATS = (".usdc", ".usda", ".usd")
+PICTURE_FORMATS = {".gif": "GIF", ".webp": "WEBP"}
+
+
+def write_usd_points(path: str | Path, clouds: Iterable[PointCloud], fps: float) -> None:
+    """Writes a sequence of oriented points as USD: one `Points` prim, time-sampled, counts may change.
+
+    Metres, y up. Widths are the points' own spacing, so that Blender or usdview show a closed surface.
+
+    Args:
+        path: ends in .usdc (compact), .usda (text) or .usd.
+        clouds: one a frame; may be a generator, and only one is in memory at a time.
+        fps: frames per second; frame i has time code i.
+
+    Raises:
+        AvatarError: for no frames, wrong shapes, non-finite values or fps, or when usd-core is missing.
+        DataError: for another file name ending.
+    """
+    usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
+
+    def define(stage: Any) -> Callable[[PointCloud, int], None]:
+        prim = usd_geom.Points.Define(stage, "/avatar/points")
+        prim.SetNormalsInterpolation(usd_geom.Tokens.vertex)
+
+        def sample(cloud: PointCloud, frame: int) -> None:
+            dims = check_shape("points", cloud.points, "N 3")
+            check_shape("normals", cloud.normals, "N 3", **dims)
+            check_finite("points", cloud.points)
+            check_finite("normals", cloud.normals)
+            widths = 2 * disc_radii(np.asarray(cloud.points, np.float64))
+            prim.GetPointsAttr().Set(_vectors(vt, cloud.points), frame)
+            prim.GetNormalsAttr().Set(_vectors(vt, cloud.normals), frame)
+            prim.GetWidthsAttr().Set(vt.FloatArray.FromNumpy(widths.astype(np.float32)), frame)
+            prim.GetExtentAttr().Set(_extent(vt, cloud.points, widths.max() / 2), frame)
+
+        return sample
+
+    _write_usd(path, clouds, fps, define)
+
+
+def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float) -> None:
+    """Writes a sequence of meshes as USD: one `Mesh` prim, time-sampled, whose triangles may change by frame.
+
+    Metres, y up, right-handed, no subdivision; colours become ``displayColor``. Blender, Maya and Unreal read it.
+
+    Args:
+        path: ends in .usdc (compact), .usda (text) or .usd.
+        meshes: one a frame; may be a generator, and only one is in memory at a time.
+        fps: frames per second; frame i has time code i.
+
+    Raises:
+        AvatarError: for no frames, meshes that are not sound, fps, or when usd-core is missing.
+        DataError: for another file name ending.
+    """
+    usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
+
+    def define(stage: Any) -> Callable[[Mesh, int], None]:
+        prim = usd_geom.Mesh.Define(stage, "/avatar/mesh")
+        prim.CreateSubdivisionSchemeAttr(usd_geom.Tokens.none)
+        prim.CreateOrientationAttr(usd_geom.Tokens.rightHanded)
+        prim.CreateDoubleSidedAttr(True)
+
+        def sample(mesh: Mesh, frame: int) -> None:
+            check_mesh(mesh)
+            prim.GetPointsAttr().Set(_vectors(vt, mesh.vertices), frame)
+            counts = np.full(len(mesh.faces), 3, np.int32)
+            prim.GetFaceVertexCountsAttr().Set(vt.IntArray.FromNumpy(counts), frame)
+            corners = np.ascontiguousarray(mesh.faces, np.int32).reshape(-1)
+            prim.GetFaceVertexIndicesAttr().Set(vt.IntArray.FromNumpy(corners), frame)
+            prim.GetExtentAttr().Set(_extent(vt, mesh.vertices, 0.0), frame)
+            if mesh.colors is not None:
+                primvar = prim.CreateDisplayColorPrimvar(usd_geom.Tokens.vertex)
+                primvar.Set(_vectors(vt, mesh.colors), frame)
+
+        return sample
+
+    _write_usd(path, meshes, fps, define)
+
+
+def _write_usd(path: str | Path, items: Iterable, fps: float, define: Callable) -> None:
+    """The stage around the samples: units, axes, time; whole or not at all."""
+    path = Path(path)
+    if path.suffix.lower() not in USD_FORMATS:
+        raise DataError(path, f"expected a USD file ending in {', '.join(USD_FORMATS)}, got {path.suffix!r}.")
+    _check_fps(fps)
+    usd, usd_geom = require("pxr.Usd"), require("pxr.UsdGeom")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent) as folder:
+        partial = Path(folder) / f"stage{path.suffix.lower()}"
+        stage = usd.Stage.CreateNew(str(partial))
+        usd_geom.SetStageUpAxis(stage, usd_geom.Tokens.y)
+        usd_geom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetFramesPerSecond(fps)
+        stage.SetDefaultPrim(usd_geom.Xform.Define(stage, "/avatar").GetPrim())
+        sample = define(stage)
+        frame = -1
+        for frame, item in enumerate(items):
+            sample(item, frame)
+        if frame < 0:
+            raise AvatarError("frames: expected at least one to write, got none.")
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(frame)
+        stage.GetRootLayer().Save()
+        partial.replace(path)
+
+
+def _vectors(vt: Any, values: np.ndarray) -> Any:
+    return vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+
+
+def _extent(vt: Any, points: np.ndarray, margin: float) -> Any:
+    return _vectors(vt, np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin]))
+
+
+def _check_fps(fps: float) -> None:
+    if not 0 < fps <= 1000:
+        raise AvatarError(f"fps: expected frames per second in (0, 1000], got {fps}.")
+
+
+def write_animation(path: str | Path, images: Sequence[np.ndarray], fps: float) -> None:
+    """Writes pictures as a film that loops: WebP in full colour, or GIF in 255 colours and steps of 10 ms.
+
+    Args:
+        path: ends in .webp or .gif.
+        images: ``(H, W, 3)`` uint8, all of one size.
+        fps: frames per second.
+
+    Raises:
+        AvatarError: for no pictures, different sizes or fps.
+        DataError: for another file name ending.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in PICTURE_FORMATS:
+        raise DataError(path, f"expected a film ending in {', '.join(PICTURE_FORMATS)}, got {path.suffix!r}.")
+    _check_fps(fps)
+    if not len(images):
+        raise AvatarError("images: expected at least one picture, got none.")
+    height, width = check_shape("images[0]", images[0], "H W 3").values()
+    for picture in images:
+        check_shape("images", picture, f"{height} {width} 3")
+    frames = [require("PIL.Image").fromarray(np.ascontiguousarray(picture, np.uint8)) for picture in images]
+    kind = PICTURE_FORMATS[path.suffix.lower()]
+    if kind == "GIF":
+        frames = [frame.quantize(255, dither=0) for frame in frames]
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / f"film{path.suffix.lower()}"
+        frames[0].save(
+            film, kind, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, quality=85
+        )
+        write_whole(path, film.read_bytes())

@@ -1,0 +1,273 @@
+"""Meshes from oriented points: open3d's Poisson reconstruction behind a guard, then trimmed to the points.
+
+open3d crashes or hangs on bad input and, rarely, on good input. It therefore runs in a process of its own, gets
+checked arrays only, and a frame that kills it is one failed frame.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from avatar.checks import INSTALL_LINES, AvatarError, DataError, check_finite, check_shape, require
+from avatar.export.poisson import FAILED, READY, SOLVED, serve
+from avatar.export.trimming import trim_surface
+from avatar.io.meshes import FORMATS, check_mesh, read_mesh, write_mesh
+from avatar.io.points import read_points
+from avatar.records import Mesh, PointCloud
+
+MIN_POINTS = 100
+EXTENTS = (1e-3, 1e3)  # metres; outside, open3d hangs or the units are wrong
+START_TIMEOUT_S = 120.0  # importing open3d from a cold disk
+
+
+class MeshingError(AvatarError):
+    """A cloud that could not be meshed, with the reason. The program goes on, and so may the next cloud."""
+
+
+@dataclass
+class PoissonConfig:
+    """How point clouds become meshes."""
+
+    depth: int = 8  # octree levels: 2 ** depth cells across 1.1 times the cloud; 8 is about 8 mm for a person
+    max_hole: float = 0.03  # metres; gaps in the points up to this wide are closed, wider ones stay open
+    min_part: float = 0.005  # connected parts with a smaller share of the area are dropped
+    timeout_s: float = 120.0  # seconds for one cloud
+    max_points: int = 1_000_000
+    memory_gb: float = 8.0  # address space of the worker, GiB; 0 for no limit
+
+    def __post_init__(self):
+        for name, low, high in (
+            ("depth", 4, 12),
+            ("max_hole", 1e-3, 10),
+            ("min_part", 0, 1),
+            ("timeout_s", 0.001, 86400),
+            ("max_points", MIN_POINTS, 20_000_000),
+            ("memory_gb", 0, 1024),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise AvatarError(f"{name}: expected a number from {low} to {high}, got {value}.")
+
+
+class PoissonMesher:
+    """Meshes clouds one after another in one worker process, which is replaced when it dies or hangs.
+
+    A context manager: ``with PoissonMesher() as mesher: mesh = mesher.mesh(cloud)``. The same cloud gives the
+    same mesh, bit for bit. As with every spawned process, a script that uses it needs the usual
+    ``if __name__ == "__main__":``.
+    """
+
+    def __init__(self, config: PoissonConfig | None = None):
+        self.config = config or PoissonConfig()
+        self._process = None
+        self._connection = None
+
+    def __enter__(self) -> PoissonMesher:
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.close()
+
+    @property
+    def worker_pid(self) -> int | None:
+        """Process id of the worker, None while there is none."""
+        return self._process.pid if self._process is not None else None
+
+    def mesh(self, cloud: PointCloud) -> Mesh:
+        """The surface the points lie on, open where they leave it open.
+
+        Args:
+            cloud: ``points (N, 3)`` metres, ``normals (N, 3)`` pointing outwards, of any length but zero.
+
+        Returns:
+            A mesh with float32 vertices and int64 faces.
+
+        Raises:
+            MeshingError: for points that cannot be meshed, a timeout, or a worker that died; the reason is named.
+            AvatarError: when open3d cannot be imported.
+        """
+        points, normals = check_cloud(cloud, self.config.max_points)
+        raw = self._solve(points, normals)
+        try:
+            check_mesh(raw)
+        except AvatarError as error:
+            raise MeshingError(f"Poisson reconstruction gave no sound surface: {error}") from error
+        mesh = trim_surface(raw, PointCloud(points, normals), self.config.max_hole, self.config.min_part)
+        if not len(mesh.faces):
+            raise MeshingError(
+                "no part of the reconstructed surface is supported by the points. They may be noise, or further "
+                f"apart than max_hole={self.config.max_hole} m; make max_hole larger."
+            )
+        return Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int64))
+
+    def close(self) -> None:
+        """Ends the worker. The next `mesh` starts another."""
+        if self._connection is not None:
+            self._connection.close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+        self._process = self._connection = None
+
+    def _solve(self, points: np.ndarray, normals: np.ndarray) -> Mesh:
+        """One job for the worker; whatever goes wrong, the next job finds a fresh one."""
+        if self._process is None or not self._process.is_alive():
+            self._start()
+        config, sound = self.config, False
+        try:
+            for array in (points, normals, np.array([config.depth], np.int32)):
+                self._connection.send_bytes(array)
+            if not self._connection.poll(config.timeout_s):
+                raise MeshingError(f"no surface within timeout_s={config.timeout_s} s; depth={config.depth}.")
+            verdict = self._connection.recv_bytes()
+            if verdict == FAILED:
+                raise MeshingError(f"open3d: {self._connection.recv_bytes().decode()}")
+            vertices = np.frombuffer(self._connection.recv_bytes(), np.float64).reshape(-1, 3)
+            faces = np.frombuffer(self._connection.recv_bytes(), np.int32).reshape(-1, 3)
+            sound = verdict == SOLVED
+        except (EOFError, OSError) as error:
+            self._process.join(timeout=5)
+            code = self._process.exitcode
+            raise MeshingError(
+                f"the meshing process died (exit code {code}) on {len(points)} points. Try a lower depth than "
+                f"{config.depth}, or more than memory_gb={config.memory_gb}."
+            ) from error
+        finally:
+            if not sound:
+                self.close()
+        return Mesh(vertices, faces)
+
+    def _start(self) -> None:
+        self.close()
+        context = multiprocessing.get_context("spawn")  # a forked copy of a threaded process may hang
+        self._connection, far_end = context.Pipe()
+        memory = int(self.config.memory_gb * 2**30)
+        self._process = context.Process(target=serve, args=(far_end, memory), name="poisson", daemon=True)
+        self._process.start()
+        far_end.close()
+        try:
+            if not self._connection.poll(START_TIMEOUT_S):
+                raise MeshingError(f"the meshing process did not start within {START_TIMEOUT_S} s.")
+            verdict = self._connection.recv_bytes()
+            reason = self._connection.recv_bytes().decode() if verdict != READY else ""
+        except (EOFError, OSError) as error:
+            self.close()
+            raise AvatarError(
+                "the meshing process died while importing open3d. A script that meshes needs "
+                f"'if __name__ == \"__main__\":'; otherwise run: {INSTALL_LINES['open3d']}"
+            ) from error
+        if reason:
+            self.close()
+            raise AvatarError(f"open3d cannot be imported ({reason}). Run: {INSTALL_LINES['open3d']}")
+
+
+def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points and unit normals as float64, after refusing all that is known to crash or hang open3d.
+
+    Raises:
+        MeshingError: naming the reason.
+    """
+    try:
+        dims = check_shape("points", cloud.points, "N 3")
+        check_shape("normals", cloud.normals, "N 3", **dims)
+        check_finite("points", cloud.points)
+        check_finite("normals", cloud.normals)
+    except AvatarError as error:
+        raise MeshingError(str(error)) from error
+    if dims["N"] > max_points:
+        raise MeshingError(f"points: expected at most max_points={max_points}, got {dims['N']}.")
+    points = np.ascontiguousarray(cloud.points, np.float64)
+    normals = np.ascontiguousarray(cloud.normals, np.float64)
+    different = len(np.unique(points, axis=0))
+    if different < MIN_POINTS:
+        raise MeshingError(f"points: expected at least {MIN_POINTS} different ones, got {different}.")
+    extent = float(np.ptp(points, axis=0).max())
+    if not EXTENTS[0] <= extent <= EXTENTS[1]:
+        raise MeshingError(
+            f"points: expected {EXTENTS[0]} to {EXTENTS[1]} m from end to end, got {extent:.3g} m. "
+            "Convert them to metres, and remove outliers."
+        )
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    if lengths.min() < 1e-6:
+        raise MeshingError(f"normals: expected directions, got {int((lengths < 1e-6).sum())} of length zero.")
+    return points, normals / lengths
+
+
+@dataclass(frozen=True)
+class MeshingReport:
+    """What became of each frame of a folder: ``done`` and ``skipped`` names, ``failed`` name to reason."""
+
+    done: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
+    failed: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def mesh_folder(
+    predictions_dir: str | Path,
+    meshes_dir: str | Path,
+    formats: tuple[str, ...] = ("ply", "obj", "glb"),
+    frames: Iterable[str] | None = None,
+    config: PoissonConfig | None = None,
+) -> MeshingReport:
+    """Meshes the point clouds ``<name>.ply`` of one folder into ``<name>.<format>`` in another.
+
+    Sound meshes newer than their cloud are kept, so that an interrupted run goes on where it stopped. A frame
+    that fails does not stop the others; it is in the report with its reason.
+
+    Args:
+        predictions_dir: folder of oriented point clouds.
+        meshes_dir: folder to write to; made if need be.
+        formats: file name endings to write: ply, obj, glb, stl, off.
+        frames: names to mesh; all in the folder if None.
+        config: settings of the reconstruction.
+
+    Raises:
+        DataError: when there is nothing to mesh or a named frame is missing.
+        AvatarError: for another format, or when open3d is missing.
+    """
+    started = time.monotonic()
+    unknown = [ending for ending in formats if f".{ending}" not in FORMATS]
+    if unknown or not formats:
+        raise AvatarError(f"formats: expected some of {' '.join(FORMATS)} without the dot, got {tuple(formats)}.")
+    predictions_dir, meshes_dir = Path(predictions_dir), Path(meshes_dir)
+    there = sorted(path.stem for path in predictions_dir.glob("*.ply"))
+    names = there if frames is None else list(frames)
+    missing = sorted(set(names) - set(there))
+    if not names or missing:
+        what = f"no point clouds named {', '.join(missing)}" if missing else "no point clouds (*.ply)"
+        raise DataError(predictions_dir, f"{what} in this folder.", "Run tools/predict.py first.")
+    done, skipped, failed = [], [], {}
+    with PoissonMesher(config) as mesher:
+        for name in require("tqdm").tqdm(names, desc="meshing", unit="frame"):
+            source = predictions_dir / f"{name}.ply"
+            targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
+            if all(_is_fresh(target, source) for target in targets):
+                skipped.append(name)
+                continue
+            try:
+                mesh = mesher.mesh(read_points(source))
+            except (MeshingError, DataError) as error:
+                failed[name] = str(error)
+                continue
+            for target in targets:
+                write_mesh(target, mesh)
+            done.append(name)
+    return MeshingReport(tuple(done), tuple(skipped), failed, time.monotonic() - started)
+
+
+def _is_fresh(target: Path, source: Path) -> bool:
+    """Whether a mesh is there, newer than its cloud, and sound."""
+    if not target.is_file() or target.stat().st_mtime_ns < source.stat().st_mtime_ns:
+        return False
+    try:
+        read_mesh(target)
+    except DataError:
+        return False
+    return True

@@ -1,0 +1,227 @@
+"""Pictures of point clouds and meshes of people, and sheets of them: comparable across methods and frames."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
+from avatar.export.drawing import (
+    BACKGROUND,
+    DISC_CORNERS,
+    Camera,
+    disc_radii,
+    discs,
+    draw,
+    frame_camera,
+    load_pyvista,
+    shade,
+)
+from avatar.io.meshes import check_mesh
+from avatar.io.npz import write_whole
+from avatar.records import Mesh, PointCloud
+
+CLAY = (0.80, 0.74, 0.68)
+BACK_FACE = 0.42  # brightness of surfaces seen from behind
+INK = (52, 52, 56)
+PAPER = tuple(round(channel * 255) for channel in BACKGROUND)
+PICTURE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+
+
+def render_points(
+    cloud: PointCloud,
+    camera: Camera | None = None,
+    colors: str | tuple | np.ndarray = "normals",
+    radius: float | None = None,
+) -> np.ndarray:
+    """A picture of oriented points as overlapping discs, which reads as a surface; seen from behind it is darker.
+
+    Args:
+        cloud: ``points (N, 3)`` metres and ``normals (N, 3)``.
+        camera: where to look from; frames the cloud from the front if None.
+        colors: "normals" (in the camera's frame), one RGB colour, or ``(N, 3)`` RGB, all in [0, 1].
+        radius: of a disc, metres; from the spacing of the points if None.
+
+    Returns:
+        ``(H, W, 3)`` uint8.
+
+    Raises:
+        AvatarError: on wrong shapes, non-finite values, or when pictures cannot be made on this machine.
+    """
+    dims = check_shape("points", cloud.points, "N 3")
+    check_shape("normals", cloud.normals, "N 3", **dims)
+    points, normals = (np.asarray(values, np.float64) for values in (cloud.points, cloud.normals))
+    check_finite("points", points)
+    check_finite("normals", normals)
+    camera = camera or frame_camera(points)
+    facing = normals @ camera.axes[2]
+    shades = shade(np.where(facing[:, None] < 0, -normals, normals), colors, camera)
+    shades *= np.where(facing < 0, BACK_FACE, 1.0)[:, None]
+    corners = discs(points, normals, disc_radii(points) if radius is None else np.full(len(points), radius))
+    faces = np.arange(corners.shape[0] * DISC_CORNERS).reshape(-1, DISC_CORNERS)
+    surface = load_pyvista().PolyData.from_regular_faces(corners.reshape(-1, 3), faces)
+    return draw([(surface, shades.repeat(DISC_CORNERS, axis=0), None)], camera)
+
+
+def render_mesh(mesh: Mesh, camera: Camera | None = None, colors: str | tuple | np.ndarray | None = None) -> np.ndarray:
+    """A picture of a mesh, smooth shaded; the inside of an open surface is darker.
+
+    Args:
+        mesh: the mesh.
+        camera: where to look from; frames the mesh from the front if None.
+        colors: "normals", one RGB colour or ``(V, 3)`` RGB in [0, 1]; the mesh's own or clay if None.
+
+    Returns:
+        ``(H, W, 3)`` uint8.
+
+    Raises:
+        AvatarError: for a mesh that is not sound, or when pictures cannot be made on this machine.
+    """
+    check_mesh(mesh)
+    camera = camera or frame_camera(mesh.vertices)
+    if colors is None:
+        colors = CLAY if mesh.colors is None else mesh.colors
+    normals = _vertex_normals(mesh)
+    surface = load_pyvista().PolyData.from_regular_faces(mesh.vertices.astype(np.float64), mesh.faces)
+    outside, inside = shade(normals, colors, camera), shade(-normals, colors, camera) * BACK_FACE
+    return draw([(surface, outside, "back"), (surface.copy(), inside, "front")], camera)
+
+
+def render_error(
+    cloud: PointCloud,
+    errors: np.ndarray,
+    max_error: float,
+    camera: Camera | None = None,
+    colormap: str = "turbo",
+) -> np.ndarray:
+    """A picture of points coloured by their error; zero is the low end of the map, ``max_error`` its high end.
+
+    Args:
+        cloud: the points with normals.
+        errors: ``(N,)`` metres, not negative.
+        max_error: metres.
+        camera: as for `render_points`.
+        colormap: a name matplotlib knows.
+
+    Returns:
+        ``(H, W, 3)`` uint8.
+    """
+    check_shape("errors", errors, "N", N=len(cloud.points))
+    check_finite("errors", errors)
+    if not max_error > 0:
+        raise AvatarError(f"max_error: expected a positive number of metres, got {max_error}.")
+    return render_points(cloud, camera, map_colors(errors / max_error, colormap))
+
+
+def map_colors(values: np.ndarray, colormap: str = "turbo") -> np.ndarray:
+    """RGB colours ``(..., 3)`` in [0, 1] of values in [0, 1]; values outside take the colour of the nearer end."""
+    maps = require("matplotlib").colormaps
+    if colormap not in maps:
+        raise AvatarError(f"colormap: expected a name known to matplotlib (turbo, viridis), got {colormap!r}.")
+    return maps[colormap](np.clip(values, 0, 1))[..., :3]
+
+
+def _vertex_normals(mesh: Mesh) -> np.ndarray:
+    """Area-weighted unit normals ``(V, 3)``, zero where undefined."""
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
+    crosses = np.cross(b - a, c - a)
+    normals = np.zeros((len(mesh.vertices), 3))
+    for axis in range(3):
+        normals[:, axis] = np.bincount(mesh.faces.reshape(-1), crosses[:, axis].repeat(3), minlength=len(normals))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+
+
+def contact_sheet(
+    rows: Sequence[Sequence[np.ndarray]],
+    row_labels: Sequence[str] = (),
+    column_labels: Sequence[str] = (),
+    gap: int = 8,
+) -> np.ndarray:
+    """One picture of many of one size, in rows and columns with labels at the left and on top.
+
+    Args:
+        rows: rows of ``(H, W, 3)`` uint8 pictures; a short row ends in empty places.
+        row_labels: one a row, or none; written upwards.
+        column_labels: one a column, or none.
+        gap: pixels between pictures.
+
+    Returns:
+        ``(H', W', 3)`` uint8.
+
+    Raises:
+        AvatarError: when pictures differ in size or labels do not fit the rows and columns.
+    """
+    pictures = [picture for row in rows for picture in row]
+    if not pictures:
+        raise AvatarError("rows: expected at least one picture, got none.")
+    for picture in pictures:
+        _check_picture("rows", picture)
+        if picture.shape != pictures[0].shape:
+            raise AvatarError(f"rows: expected pictures of one size, got {picture.shape} and {pictures[0].shape}.")
+    columns = max(len(row) for row in rows)
+    for name, labels, count in (("row", row_labels, len(rows)), ("column", column_labels, columns)):
+        if labels and len(labels) != count:
+            raise AvatarError(f"{name}_labels: expected {count} or none, got {len(labels)}.")
+    height, width = pictures[0].shape[:2]
+    letter = max(12, height // 32)
+    left, top = (2 * letter if row_labels else 0), (2 * letter if column_labels else 0)
+    shape = (top + len(rows) * (height + gap) - gap, left + columns * (width + gap) - gap, 3)
+    sheet = np.full(shape, PAPER, np.uint8)
+    for i, row in enumerate(rows):
+        for j, picture in enumerate(row):
+            y, x = top + i * (height + gap), left + j * (width + gap)
+            sheet[y : y + height, x : x + width] = picture
+    for j, label in enumerate(column_labels):
+        x = left + j * (width + gap)
+        sheet[:top, x : x + width] = _label(label, width, top, letter)
+    for i, label in enumerate(row_labels):
+        y = top + i * (height + gap)
+        sheet[y : y + height, :left] = np.rot90(_label(label, height, left, letter))
+    return sheet
+
+
+def color_bar(max_error: float, height: int = 960, colormap: str = "turbo") -> np.ndarray:
+    """The scale that belongs to `render_error`: a strip from 0 to ``max_error`` metres, written in millimetres."""
+    letter = max(12, height // 32)
+    bar = np.full((height, 5 * letter, 3), PAPER, np.uint8)
+    ramp = map_colors(np.linspace(1, 0, height - 3 * letter), colormap)
+    bar[2 * letter : height - letter, letter : 2 * letter] = np.rint(ramp * 255)[:, None]
+    for share in (0, 0.5, 1):
+        y = round(2 * letter + (1 - share) * (height - 3 * letter - 1))
+        text = _label(f"{share * max_error * 1000:.3g}", 3 * letter, 2 * letter, letter)
+        bar[max(0, y - letter) : y + letter, 2 * letter :] = text[: min(height, y + letter) - max(0, y - letter)]
+    bar[: round(1.2 * letter), : 2 * letter] = _label("mm", 2 * letter, round(1.2 * letter), letter)
+    return bar
+
+
+def save_picture(path: str | Path, picture: np.ndarray) -> None:
+    """Writes a ``(H, W, 3)`` uint8 picture as PNG or JPEG, whole or not at all; equal pictures, equal bytes."""
+    path = Path(path)
+    if path.suffix.lower() not in PICTURE_FORMATS:
+        raise DataError(path, f"expected a picture ending in {', '.join(PICTURE_FORMATS)}, got {path.suffix!r}.")
+    _check_picture("picture", picture)
+    encoded = io.BytesIO()
+    image = require("PIL.Image").fromarray(picture)
+    image.save(encoded, format=PICTURE_FORMATS[path.suffix.lower()], quality=92)
+    write_whole(path, encoded.getvalue())
+
+
+def _check_picture(name: str, picture: np.ndarray) -> None:
+    check_shape(name, picture, "H W 3")
+    if picture.dtype != np.uint8:
+        raise AvatarError(f"{name}: expected uint8 pictures, got {picture.dtype}.")
+
+
+def _label(text: str, width: int, height: int, letter: int) -> np.ndarray:
+    """Text in the middle of a strip of paper, smaller where it would not fit."""
+    strip = require("PIL.Image").new("RGB", (width, height), PAPER)
+    pen = require("PIL.ImageDraw").Draw(strip)
+    font = require("PIL.ImageFont").load_default(letter)
+    taken = pen.textlength(text, font=font)
+    if taken > width:
+        font = require("PIL.ImageFont").load_default(letter * width / taken)
+    pen.text((width / 2, height / 2), text, fill=INK, font=font, anchor="mm")
+    return np.asarray(strip)

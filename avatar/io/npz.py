@@ -1,0 +1,169 @@
+"""Array files (npz): read without trust (sizes checked first, no pickles), written whole and reproducibly."""
+
+from __future__ import annotations
+
+import io
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from avatar.checks import AvatarError, DataError, check_finite, check_shape
+
+SIZE_LIMIT = 4 << 30  # bytes of arrays in one file, unpacked
+MEMBER_LIMIT = 200
+DTYPE_KINDS = {"float": "f", "int": "iu", "bool": "b", "text": "U", "number": "fiu"}
+READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # one time stamp for all members, so that equal arrays give equal bytes
+
+
+def read_arrays(
+    path: Path,
+    required: Mapping[str, str],
+    optional: Mapping[str, str] | None = None,
+    limit: int = SIZE_LIMIT,
+) -> dict[str, np.ndarray]:
+    """Reads named arrays of an npz file; other keys are never decoded, so what they hold does not matter.
+
+    A key is described by its kind and its shape, as in ``"float V 3"`` or ``"float V 3 3 | V 4 4"``: kinds
+    are float, int, bool, text, number, or an exact dtype such as uint8; a named size must be the same
+    wherever it stands. Member sizes and array headers are checked before anything is allocated.
+
+    Args:
+        path: the npz file.
+        required: key to description; all must be there.
+        optional: key to description; read where present.
+        limit: bytes that all arrays of the file may take unpacked.
+
+    Raises:
+        DataError: naming file, key, what was expected and what came: missing or damaged file, oversized or
+            pickled members, missing keys, wrong kinds or shapes, NaN or infinite numbers.
+    """
+    path, optional = Path(path), optional or {}
+    if not path.is_file():
+        raise DataError(path, "expected an npz file, there is none.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = _members(path, archive, limit)
+            absent = [key for key in required if key not in members]
+            if absent:
+                there = ", ".join(sorted(members)) or "none"
+                raise DataError(path, f"expected the keys {', '.join(absent)}, found only: {there}.")
+            dims: dict[str, int] = {}
+            wanted = {**required, **{key: optional[key] for key in optional if key in members}}
+            return {key: _read(path, archive, members[key], key, wanted[key], dims) for key in wanted}
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+        mend = "Make or download it again."
+        raise DataError(path, f"expected a sound npz file, reading failed: {error}.", mend) from error
+
+
+def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipfile.ZipInfo]:
+    """Array members by key, after the checks that need no reading."""
+    infos = archive.infolist()
+    if len(infos) > MEMBER_LIMIT:
+        raise DataError(path, f"expected at most {MEMBER_LIMIT} arrays, found {len(infos)}.")
+    total = sum(info.file_size for info in infos)
+    if total > limit:
+        raise DataError(path, f"expected at most {limit} bytes of arrays, it declares {total}.")
+    members = {info.filename.removesuffix(".npy"): info for info in infos}
+    if len(members) != len(infos):
+        raise DataError(path, "expected every key once, found a key twice.")
+    return members
+
+
+def _read(
+    path: Path,
+    archive: zipfile.ZipFile,
+    info: zipfile.ZipInfo,
+    key: str,
+    description: str,
+    dims: dict[str, int],
+) -> np.ndarray:
+    """One member as an array; ``dims`` carries the named sizes from key to key."""
+    kind, _, pattern = description.partition(" ")
+    try:
+        with archive.open(info) as stream:
+            shape, fortran, dtype = READERS[np.lib.format.read_magic(stream)](stream)
+            start = stream.tell()
+            _check_header(path, key, shape, dtype, kind, info.file_size - start)
+            array = np.frombuffer(bytearray(stream.read()), dtype=dtype)
+            array = array.reshape(shape, order="F" if fortran else "C")
+    except (KeyError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(path, f"{key}: expected a plain array, its header is not one ({error}).") from error
+    try:
+        dims.update(_match(key, array, pattern, dims))
+        if array.dtype.kind == "f":
+            check_finite(key, array)
+    except AvatarError as error:
+        raise DataError(path, str(error)) from error
+    return array
+
+
+def _check_header(path: Path, key: str, shape: tuple, dtype: np.dtype, kind: str, stored: int) -> None:
+    """Refuses an array whose header promises other than its member holds, or another kind than is wanted."""
+    if dtype.hasobject or dtype.names:
+        raise DataError(path, f"{key}: expected {kind}, found Python objects or records: not read.")
+    if (dtype.kind not in DTYPE_KINDS[kind]) if kind in DTYPE_KINDS else dtype != np.dtype(kind):
+        raise DataError(path, f"{key}: expected {kind}, got {dtype}.")
+    size = dtype.itemsize
+    for length in shape:
+        size *= length
+    if any(length < 0 for length in shape) or size != stored:
+        raise DataError(path, f"{key}: its header declares {size} bytes of {shape}, the file holds {stored}.")
+
+
+def _match(key: str, array: np.ndarray, pattern: str, dims: dict[str, int]) -> dict[str, int]:
+    """Named sizes after the first of the patterns ``A | B`` that fits."""
+    choices = [choice.strip() for choice in pattern.split("|")]
+    for choice in choices:
+        try:
+            return check_shape(key, array, choice, **dims)
+        except AvatarError:
+            if choice == choices[-1]:
+                raise
+    return dims
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes an npz file whole or not at all; equal arrays give equal bytes, so that files can be hashed.
+
+    Raises:
+        AvatarError: for an array of Python objects.
+    """
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for key, value in arrays.items():
+            array = np.asarray(value)
+            if array.dtype.hasobject:
+                raise AvatarError(f"{key}: expected numbers or text to write to {path}, got Python objects.")
+            plain = io.BytesIO()
+            np.lib.format.write_array(plain, array, allow_pickle=False)
+            info = zipfile.ZipInfo(f"{key}.npy", ZIP_EPOCH)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(info, plain.getvalue(), compresslevel=9)
+    write_whole(path, packed.getvalue())
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Writes a file atomically: a temporary file beside it, flushed, then renamed. Makes its folder."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    try:
+        with part.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -1,0 +1,166 @@
+"""Oriented point clouds on disk: binary PLY out, any scalar PLY (ASCII, little or big endian) in."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from avatar.checks import DataError, check_finite, check_shape
+from avatar.io.npz import write_whole
+from avatar.records import PointCloud
+
+MAX_BYTES = 2 << 30
+MAX_POINTS = 20_000_000
+MAX_HEADER = 1 << 16
+EXACT_LENGTH = 1e-5  # normals closer to unit length than this are kept bit for bit
+LENGTH_TOLERANCE = 1e-2  # and closer than this are renormalised
+COLUMNS = ("x", "y", "z", "nx", "ny", "nz")
+SCALARS = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What a PLY header promises of its vertices.
+
+    ``byte_order`` is ``<``, ``>`` or empty for ASCII; ``count`` vertices, each of ``properties`` (name, numpy
+    scalar code), stand ``start`` bytes into the file.
+    """
+
+    byte_order: str
+    count: int
+    properties: tuple[tuple[str, str], ...]
+    start: int
+
+
+def write_points(path: str | Path, cloud: PointCloud) -> None:
+    """Writes a cloud as binary little-endian PLY, float32 ``x y z nx ny nz``, metres.
+
+    Equal clouds give equal bytes. The file appears whole or not at all.
+
+    Raises:
+        AvatarError: on wrong shapes, no points or non-finite values.
+        DataError: when the file name does not end in .ply.
+    """
+    path = Path(path)
+    _check_suffix(path)
+    dims = check_shape("points", cloud.points, "N 3")
+    check_shape("normals", cloud.normals, "N 3", **dims)
+    values = np.concatenate([cloud.points, cloud.normals], axis=1).astype("<f4")
+    check_finite("points, normals", values)
+    if not len(values):
+        raise DataError(path, "expected at least one point to write, got an empty cloud.")
+    lines = ["ply", "format binary_little_endian 1.0", "comment metres, y up", f"element vertex {len(values)}"]
+    lines += [*(f"property float {name}" for name in COLUMNS), "end_header", ""]
+    write_whole(path, "\n".join(lines).encode("ascii") + values.tobytes())
+
+
+def read_points(path: str | Path) -> PointCloud:
+    """Reads an oriented point cloud from a PLY file: float32 points and unit normals, both ``(N, 3)``.
+
+    Foreign files are welcome: ASCII or binary, further properties and elements are ignored. Normals a little off
+    unit length are renormalised.
+
+    Raises:
+        DataError: naming the file and what is wrong with it: missing, another format, damaged, empty, too large,
+            no normals, non-finite values or normals far from unit length.
+    """
+    path = Path(path)
+    _check_suffix(path)
+    if not path.is_file():
+        raise DataError(path, "there is no such file.")
+    if path.stat().st_size > MAX_BYTES:
+        raise DataError(path, f"expected at most {MAX_BYTES} bytes, got {path.stat().st_size}.")
+    data = path.read_bytes()
+    header = read_ply_header(path, data)
+    values = _read_columns(path, data, header)
+    if not np.isfinite(values).all():
+        bad = int((~np.isfinite(values)).any(axis=1).sum())
+        raise DataError(path, f"{bad} of {len(values)} points are NaN or infinite.", "Remove them and try again.")
+    points, normals = values[:, :3], values[:, 3:]
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    off = np.abs(lengths - 1)
+    if off.max() > LENGTH_TOLERANCE:
+        worst = float(lengths[off.argmax(), 0])
+        raise DataError(path, f"expected unit normals, got one of length {worst:.4g}.", "Normalise them first.")
+    normals = np.where(off > EXACT_LENGTH, normals / lengths, normals)
+    return PointCloud(points.astype(np.float32), normals.astype(np.float32))
+
+
+def read_ply_header(path: Path, data: bytes) -> PlyHeader:
+    """The vertex part of a PLY header, checked against the size of the file before anything is allocated."""
+    end = re.search(rb"end_header[ \t]*\r?\n", data[:MAX_HEADER])
+    if not data.startswith(b"ply") or end is None:
+        raise DataError(path, "expected a PLY file with a header, got something else.")
+    byte_order, count, properties = None, None, []
+    element = ""
+    for line in data[: end.start()].decode("latin-1").splitlines()[1:]:
+        match line.split():
+            case ["format", kind, *_] if kind in BYTE_ORDERS:
+                byte_order = BYTE_ORDERS[kind]
+            case ["element", "vertex", number] if number.isdecimal() and element == "":
+                element, count = "vertex", int(number)
+            case ["element", name, *_]:
+                if element == "":
+                    raise DataError(path, f"expected the vertices first, got element {name!r}.")
+                element = name
+            case ["property", kind, name] if element == "vertex" and kind in SCALARS:
+                properties.append((name, SCALARS[kind]))
+            case ["property", *_] if element == "vertex":
+                raise DataError(path, f"the header line {line.strip()!r} is not a scalar vertex property.")
+    if byte_order is None or count is None:
+        raise DataError(path, "the header lacks a known format or a vertex element.")
+    if len({name for name, _ in properties}) != len(properties):
+        raise DataError(path, "the header names a vertex property twice.")
+    if count > min(MAX_POINTS, len(data)):
+        raise DataError(path, f"the header promises {count} vertices, more than the file or the limit can hold.")
+    return PlyHeader(byte_order, count, tuple(properties), end.end())
+
+
+def _read_columns(path: Path, data: bytes, header: PlyHeader) -> np.ndarray:
+    """Positions and normals as ``(N, 6)`` float64."""
+    names = [name for name, _ in header.properties]
+    missing = [name for name in COLUMNS if name not in names]
+    if missing:
+        raise DataError(
+            path,
+            f"expected the vertex properties {' '.join(COLUMNS)}, {' '.join(missing)} missing.",
+            "Estimate oriented normals first (MeshLab: Compute normals for point sets).",
+        )
+    if not header.count:
+        raise DataError(path, "expected at least one point, got an empty cloud.")
+    if not header.byte_order:
+        return _read_ascii(path, data, header, [names.index(name) for name in COLUMNS])
+    row = np.dtype([(name, header.byte_order + code) for name, code in header.properties])
+    if header.start + header.count * row.itemsize > len(data):
+        held = (len(data) - header.start) // row.itemsize
+        raise DataError(path, f"cut short: the header promises {header.count} vertices, the file holds {held}.")
+    rows = np.frombuffer(data, row, header.count, header.start)
+    return np.stack([rows[name] for name in COLUMNS], axis=1).astype(np.float64)
+
+
+def _read_ascii(path: Path, data: bytes, header: PlyHeader, columns: list[int]) -> np.ndarray:
+    """The same from the lines of an ASCII file."""
+    lines = data[header.start :].decode("latin-1").splitlines()[: header.count]
+    if len(lines) < header.count:
+        raise DataError(path, f"cut short: the header promises {header.count} vertices, got {len(lines)} lines.")
+    try:
+        values = np.loadtxt(io.StringIO("\n".join(lines)), usecols=columns, ndmin=2, comments=None)
+    except ValueError as error:
+        raise DataError(path, f"a vertex line cannot be read ({error}).") from error
+    if len(values) != header.count:
+        raise DataError(path, f"the header promises {header.count} vertices, the lines hold {len(values)}.")
+    return values
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() != ".ply":
+        raise DataError(path, f"expected a file name ending in .ply, got {path.suffix!r}.")

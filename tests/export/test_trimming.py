@@ -1,0 +1,56 @@
+"""Cutting surfaces along a line, and dropping small parts: closed forms on a flat grid."""
+
+import numpy as np
+import pytest
+
+from avatar.export.trimming import cut_surface, drop_small_parts
+from avatar.records import Mesh
+
+
+def grid(size=11):
+    """A unit square in the xy plane, facing +z."""
+    x, y = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size), indexing="xy")
+    ids = np.arange(size * size).reshape(size, size)
+    a, b, c, d = ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    return Mesh(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3), faces)
+
+
+def crosses(mesh):
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+@pytest.mark.parametrize(("slope", "offset"), [((1, 0), 0.33), ((0.6, 0.8), 0.71), ((-0.3, 1), 0.25)])
+def test_a_linear_cut_leaves_the_exact_half(slope, offset):
+    mesh = grid()
+    values = mesh.vertices[:, :2] @ slope - offset
+    kept, lost = cut_surface(mesh, values), cut_surface(mesh, -values)
+    assert (kept.vertices[:, :2] @ slope <= offset + 1e-12).all()
+    assert (crosses(kept)[:, 2] > -1e-12).all()  # still facing +z
+    assert crosses(kept)[:, 2].sum() / 2 + crosses(lost)[:, 2].sum() / 2 == pytest.approx(1)
+    if slope == (1, 0):
+        assert crosses(kept)[:, 2].sum() / 2 == pytest.approx(offset)
+    edges, used = np.unique(
+        np.sort(kept.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True
+    )
+    rim = kept.vertices[edges[used == 1].reshape(-1), :2]
+    on_border = (np.abs(rim - 0.5) > 0.5 - 1e-12).any(axis=1)
+    assert (on_border | (np.abs(rim @ slope - offset) < 1e-12)).all()  # no seams inside
+
+
+def test_all_or_nothing():
+    mesh = grid()
+    whole = cut_surface(mesh, np.full(len(mesh.vertices), -1.0))
+    np.testing.assert_array_equal(whole.vertices[whole.faces], mesh.vertices[mesh.faces])
+    assert not len(cut_surface(mesh, np.ones(len(mesh.vertices))).faces)
+
+
+def test_small_parts_go_by_area_not_by_triangle_count():
+    large = Mesh(np.array([[0, 0, 5.0], [9, 0, 5], [0, 9, 5]]), np.array([[0, 1, 2]]))
+    small = grid()
+    both = Mesh(np.concatenate([small.vertices, large.vertices]), np.concatenate([small.faces, large.faces + 121]))
+    kept = drop_small_parts(both, 0.1)
+    np.testing.assert_array_equal(kept.vertices, large.vertices)
+    np.testing.assert_array_equal(kept.faces, large.faces)
+    assert len(drop_small_parts(both, 0.001).faces) == 201
