@@ -1,0 +1,146 @@
+"""The open dataset's layout: compact simulated frames, scanned when they are loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.body.model import BodyModel
+from avatar.body.open import MEAN_SHAPE, open_body
+from avatar.body.registry import canonical_pose
+from avatar.checks import AvatarError, DataError, check_shape
+from avatar.data.outfits import SurfaceOutfit, read_outfit_settings
+from avatar.data.scanner import DressedSurface, ScanConfig, scan_mesh, scan_points
+from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_garment
+from avatar.records import BodyFit, Frame, Scan, Template
+
+
+@dataclass(frozen=True)
+class OpenBody:
+    """The open body as ``outfit.yaml`` names it: ``shape`` of the asset, ``canonical`` pose ``t`` or ``apart``."""
+
+    shape: str
+    canonical: str
+
+    @classmethod
+    def from_settings(cls, settings: dict[str, Any], path: Path) -> OpenBody:
+        """Reads ``body: {model: open, shape: female, canonical: t}``; raises `DataError` where it says otherwise."""
+        body = settings.get("body", {})
+        if not isinstance(body, dict) or body.get("model") != "open" or not isinstance(body.get("shape"), str):
+            raise DataError(path / "outfit.yaml", f"body: expected {{model: open, shape, canonical}}, got {body}.")
+        return cls(body["shape"], str(body.get("canonical", "t")))
+
+
+class OpenOutfit(SurfaceOutfit):
+    """An outfit of the open dataset: ``outfit.yaml``, ``garment.npz`` and frames of cloth and visibility."""
+
+    def __init__(self, path: Path, dataset: str = "", scanner: ScanConfig | None = None):
+        super().__init__(path, dataset)
+        self.scanner = scanner or ScanConfig()
+        self._described = OpenBody.from_settings(read_outfit_settings(self.path), self.path)
+
+    @cached_property
+    def garment(self) -> OpenGarment:
+        """The cloth's topology, its rest in the canonical pose and its labels."""
+        return read_open_garment(self.path / "garment.npz")
+
+    @cached_property
+    def body(self) -> BodyModel:
+        """The wearer."""
+        return self._make_body(self._described.shape)
+
+    @cached_property
+    def mean_body(self) -> BodyModel:
+        """The mean of all open shapes, in the same canonical space."""
+        return self._make_body(MEAN_SHAPE)
+
+    def _make_body(self, shape: str) -> BodyModel:
+        """An open body in the outfit's canonical pose."""
+        try:
+            body = open_body(shape)
+            return body.with_canonical_pose(canonical_pose(self._described.canonical, body.joint_names))
+        except DataError:
+            raise
+        except AvatarError as error:
+            raise DataError(self.path / "outfit.yaml", f"body: {error}") from error
+
+    def _read_template(self) -> Template:
+        return self.body.template
+
+    def _read_frame(self, path: Path, split: str, name: str) -> Frame:
+        stored = self._read_open_frame(path)
+        body = self.fit_pose(stored.pose, stored.translation)
+        surface = self._surface(stored, body.vertices)
+        return Frame(name, self.name, split, body, scan_points(surface, self.scanner, f"{self.name}/{name}"))
+
+    def resample(self, split: str, name: str, points: int, seed: int) -> Scan:
+        """A fresh, perfect sampling of a frame's visible surface, independent of the scanner's noise and holes."""
+        config = ScanConfig(points=points, seed=seed)
+        return scan_points(self.load_surface(split, name), config, f"{self.name}/{name}/again")
+
+    def load_mesh(self, split: str, name: str) -> Scan:
+        """What can be seen of a frame as a mesh: a scan with faces, labels and canonical positions."""
+        return scan_mesh(self.load_surface(split, name))
+
+    def load_surface(self, split: str, name: str) -> DressedSurface:
+        """Body and cloth of a frame as one labelled mesh with its visible faces."""
+        stored = self._read_open_frame(self.frame_path(split, name))
+        return self._surface(stored, self.fit_pose(stored.pose, stored.translation).vertices)
+
+    def _read_open_frame(self, path: Path) -> OpenFrame:
+        """A stored frame that fits the outfit's body and garment."""
+        stored = read_open_frame(path)
+        expected = {
+            "pose": (len(self.body.parents), 3),
+            "cloth": self.garment.canonical.shape,
+            "visible_body": (len(self.body.faces),),
+            "visible_cloth": (len(self.garment.faces),),
+        }
+        for key, shape in expected.items():
+            if getattr(stored, key).shape != shape:
+                problem = f"{key}: expected {shape} as body and garment.npz have it, got {getattr(stored, key).shape}."
+                raise DataError(path, problem, "Frame and garment are of different outfits.")
+        return stored
+
+    @torch.no_grad()
+    def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
+        """The wearer in any pose; what a pose encoder sees of it is in mean shape, with the root at rest."""
+        check_shape("pose", pose, "J 3", J=len(self.body.parents))
+        translation = np.zeros(3, np.float32) if translation is None else np.asarray(translation, np.float32)
+        pose = np.asarray(pose, np.float32)
+        turned = torch.from_numpy(pose)[None]
+        posed = self.body(turned, torch.from_numpy(translation)[None])
+        rootless = turned.clone()
+        rootless[:, 0] = self.body.canonical_pose[0]
+        return BodyFit(
+            vertices=posed.vertices[0].numpy(),
+            vertex_transforms=posed.vertex_transforms[0].numpy(),
+            joint_transforms=posed.joint_transforms[0].numpy(),
+            pose_vertices=self.mean_body(rootless).vertices[0].numpy(),
+            translation=translation,
+            pose=pose,
+        )
+
+    def _surface(self, stored: OpenFrame, body_vertices: np.ndarray) -> DressedSurface:
+        """Body and cloth as one mesh."""
+        template, garment = self.template, self.garment
+        skin = np.zeros(len(body_vertices), np.uint8)
+        return DressedSurface(
+            vertices=_stack([body_vertices, stored.cloth]),
+            canonical=_stack([template.vertices.numpy(), garment.canonical]),
+            faces=_stack([template.faces.numpy(), garment.faces + len(body_vertices)]),
+            visible=_stack([stored.visible_body, stored.visible_cloth]),
+            labels=_stack([skin, garment.labels]),
+        )
+
+
+def _stack(parts: Sequence[np.ndarray]) -> Tensor:
+    """Arrays one after the other, as a tensor."""
+    return torch.from_numpy(np.concatenate(parts))

@@ -1,0 +1,179 @@
+"""One interface to an outfit on disk, whatever its layout, and finding it by name."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from abc import ABC, abstractmethod
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avatar.checks import AvatarError, DataError, require
+from avatar.data.soundness import check_frame, check_template
+from avatar.records import BodyFit, Frame, Scan, Template
+
+SPLITS = ("train", "test")
+SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+SAMPLE_FOLDER = Path(__file__).parents[1] / "assets" / "sample"
+OUTFIT_FORMAT = "outfit/1"
+
+
+class Outfit(ABC):
+    """One person in one set of clothes: frames of scans with the body under them.
+
+    ``name``, ``dataset`` (the folder above), ``path``. `frames` and `load` are what training needs; `resample` is
+    there where the true surface is known.
+    """
+
+    def __init__(self, path: Path, dataset: str = ""):
+        self.path = Path(path)
+        self.name = self.path.name
+        self.dataset = dataset or self.path.parent.name
+
+    @cached_property
+    def template(self) -> Template:
+        """The body at rest in its canonical pose, float32.
+
+        Raises:
+            DataError: for a missing or damaged file, or a body that is not in metres.
+        """
+        template = self._read_template()
+        check_template(template, self.path)
+        return template
+
+    def frames(self, split: str) -> tuple[str, ...]:
+        """Names of the frames of a split, sorted.
+
+        Raises:
+            AvatarError: for a split other than train and test.
+            DataError: when the split's folder is missing or empty.
+        """
+        if split not in SPLITS:
+            raise AvatarError(f"split: expected train or test, got {split!r}.")
+        return self._listed[split] or self._refuse_empty(split)
+
+    def load(self, split: str, name: str) -> Frame:
+        """One frame, checked: finite, in metres, scan over body.
+
+        Raises:
+            AvatarError: for a frame that is not in the split, naming near ones.
+            DataError: for a damaged or unsound file.
+        """
+        path = self.frame_path(split, name)
+        frame = self._read_frame(path, split, name)
+        check_frame(frame, self.template, path)
+        return frame
+
+    def frame_path(self, split: str, name: str) -> Path:
+        """The file of one of the outfit's frames. Raises `AvatarError` for a name that is not among them."""
+        names = self.frames(split)
+        if name not in self._known[split]:
+            near = difflib.get_close_matches(name, names, n=3) or names[:3]
+            raise AvatarError(f"frame: {self.name} has no {split} frame {name!r}; there are {', '.join(near)}, ...")
+        return self.path / split / f"{name}.npz"
+
+    @abstractmethod
+    def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
+        """The wearer in any pose: ``(J, 3)`` axis-angle, and a translation ``(3,)`` in metres.
+
+        Raises:
+            AvatarError: for a pose of other joints, or where the layout does not know the wearer's joints.
+        """
+
+    @cached_property
+    def _listed(self) -> dict[str, tuple[str, ...]]:
+        """Frame names by split, as the folders have them."""
+        return {
+            split: tuple(sorted(p.stem for p in (self.path / split).glob("*.npz") if not p.name.startswith(".")))
+            for split in SPLITS
+        }
+
+    @cached_property
+    def _known(self) -> dict[str, frozenset[str]]:
+        """The same names for look-ups."""
+        return {split: frozenset(names) for split, names in self._listed.items()}
+
+    def _refuse_empty(self, split: str) -> tuple[str, ...]:
+        """The error of a split without frames."""
+        raise DataError(self.path / split, "expected frames (*.npz), found none.", "Make or download the data.")
+
+    @abstractmethod
+    def _read_template(self) -> Template:
+        """The body at rest, from the layout's files."""
+
+    @abstractmethod
+    def _read_frame(self, path: Path, split: str, name: str) -> Frame:
+        """One frame, from the layout's file."""
+
+
+class SurfaceOutfit(Outfit):
+    """An outfit whose true surface is known, so that it can be sampled at will."""
+
+    @abstractmethod
+    def resample(self, split: str, name: str, points: int, seed: int) -> Scan:
+        """A fresh, perfect sampling of a frame's true visible surface."""
+
+    @abstractmethod
+    def load_mesh(self, split: str, name: str) -> Scan:
+        """What can be seen of a frame as a mesh: a scan with faces."""
+
+
+def read_outfit_settings(path: Path) -> dict[str, Any]:
+    """What an outfit's ``outfit.yaml`` says, or nothing where there is none.
+
+    Raises:
+        DataError: for a file that is not a plain mapping, or of an unknown format.
+    """
+    file = Path(path) / "outfit.yaml"
+    if not file.is_file():
+        return {}
+    yaml = require("yaml")
+    try:
+        settings = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(file, f"expected plain YAML: {error}.") from error
+    if not isinstance(settings, dict):
+        raise DataError(file, f"expected a mapping, got {type(settings).__name__}.")
+    if settings.get("format", OUTFIT_FORMAT) != OUTFIT_FORMAT:
+        raise DataError(file, f"expected format {OUTFIT_FORMAT}, got {settings['format']}.", "Make the data again.")
+    return settings
+
+
+def outfit_folder(root: Path, dataset: str, outfit: str) -> Path:
+    """The folder of an outfit: ``<root>/<dataset>/<outfit>``, or the embedded one for the dataset ``sample``.
+
+    POP's nesting ``<root>/<dataset>/packed/<outfit>`` is found as well.
+
+    Raises:
+        AvatarError: for names that could leave the data root.
+        DataError: for a data set or an outfit that is not there, naming those that are.
+    """
+    for what, name in (("dataset", dataset), ("outfit", outfit)):
+        if not SAFE_NAME.fullmatch(name):
+            raise AvatarError(
+                f"{what}: expected a plain name (letters, digits, '_', '.', '-', at most 64), got {name!r}."
+            )
+    parent = SAMPLE_FOLDER if dataset == "sample" else Path(root) / dataset
+    if (parent / "packed").is_dir():
+        parent = parent / "packed"
+    if not parent.is_dir():
+        mend = f"Make it with tools/simulate.py, or put the data there as {parent}/<outfit>/train/*.npz."
+        raise DataError(parent, f"expected the folder of data set {dataset}, there is none.", mend)
+    there = outfit_names(parent)
+    if outfit not in there:
+        near = difflib.get_close_matches(outfit, there, n=1)
+        hint = f"Did you mean {near[0]}? " if near else ""
+        raise DataError(parent / outfit, f"no such outfit. {hint}There are: {', '.join(there) or 'none'}.")
+    folder = parent / outfit
+    if not folder.resolve().is_relative_to(parent.resolve()):
+        raise DataError(folder, f"expected a folder inside {parent}, it is a link to {folder.resolve()}.")
+    return folder
+
+
+def outfit_names(parent: Path) -> tuple[str, ...]:
+    """Names of the outfits in a data set's folder: those with a ``train`` or ``test`` folder, sorted."""
+    folders = (p for p in Path(parent).iterdir() if any((p / split).is_dir() for split in SPLITS))
+    return tuple(sorted(p.name for p in folders if SAFE_NAME.fullmatch(p.name)))

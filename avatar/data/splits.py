@@ -1,0 +1,103 @@
+"""Which training frames train and which validate. Test frames are never touched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from avatar.checks import AvatarError
+from avatar.data.outfits import Outfit
+
+SEVERAL_SEQUENCES = 4  # from here on whole sequences are held back, below it frames
+
+
+@dataclass
+class SplitConfig:
+    """How the training frames of an outfit are shared out."""
+
+    validation_share: float = 0.1  # held back from training to choose among checkpoints
+    train_fraction: float = 1.0  # of what is left; 0.125 is the "1/8" of the papers
+
+    def __post_init__(self):
+        if not 0 <= self.validation_share < 1 or not 0 < self.train_fraction <= 1:
+            raise AvatarError(
+                "validation_share: expected at least 0 and below 1; train_fraction: above 0 and at most 1; "
+                f"got {self.validation_share} and {self.train_fraction}."
+            )
+
+
+@dataclass(frozen=True)
+class Split:
+    """Frame names to train on and to validate on, both out of the train folder."""
+
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+
+
+def split_outfit(outfit: Outfit, config: SplitConfig | None = None) -> Split:
+    """The split of an outfit's training frames, after a check that no test frame is among them."""
+    train = outfit.frames("train")
+    test = outfit.frames("test") if (outfit.path / "test").is_dir() else ()
+    check_leakage(train, test, outfit.name)
+    return split_frames(train, config or SplitConfig())
+
+
+def split_frames(names: Sequence[str], config: SplitConfig) -> Split:
+    """Holds back validation frames, then thins the rest; depends on the names alone.
+
+    Whole sequences (the name up to its last dot) are held back where there are four or more, because neighbouring
+    frames are nearly copies; otherwise the last stretch of frames is. The fraction keeps evenly spaced frames, and
+    does not change which frames validate.
+
+    Raises:
+        AvatarError: when there are too few frames to share.
+    """
+    names = sorted(names)
+    count = round(len(names) * config.validation_share)
+    count = max(count, 1) if config.validation_share > 0 else 0
+    if count >= len(names):
+        raise AvatarError(
+            f"validation_share: expected frames left to train on, {len(names)} frames give none. Set it to 0."
+        )
+    held = set(_held_sequences(names, count) if count else ())
+    if count and not held:
+        held = set(names[len(names) - count :])
+    train = [name for name in names if name not in held]
+    kept = np.floor(np.arange(np.ceil(len(train) * config.train_fraction - 1e-9)) / config.train_fraction + 1e-9)
+    return Split(tuple(train[int(i)] for i in kept), tuple(name for name in names if name in held))
+
+
+def sequence_of(name: str) -> str:
+    """The sequence of a frame: ``walk`` of ``walk.00012``; a name without a number is its own sequence."""
+    return name.rpartition(".")[0] or name
+
+
+def _held_sequences(names: Sequence[str], count: int) -> list[str]:
+    """Frames of whole sequences, last ones first, that come near to a count; none where sequences are few."""
+    sequences: dict[str, list[str]] = {}
+    for name in names:
+        sequences.setdefault(sequence_of(name), []).append(name)
+    if len(sequences) < SEVERAL_SEQUENCES:
+        return []
+    held: list[str] = []
+    candidates = list(sequences.values())[1:]
+    for frames in reversed(candidates):
+        if abs(len(held) + len(frames) - count) < abs(len(held) - count):
+            held += frames
+    return held or min(candidates, key=len)
+
+
+def check_leakage(train: Sequence[str], test: Sequence[str], outfit: str) -> None:
+    """Refuses a frame that is both trained and tested on.
+
+    Raises:
+        AvatarError: naming the first such frames.
+    """
+    shared = sorted(set(train) & set(test))
+    if shared:
+        raise AvatarError(
+            f"{outfit}: expected different frames in train and test, {len(shared)} are in both "
+            f"({', '.join(shared[:3])}). Remove them from one."
+        )

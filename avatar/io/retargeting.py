@@ -1,0 +1,194 @@
+"""Motions of foreign skeletons carried over to the 22 body joints in SMPL order."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
+from avatar.body.open import MEAN_SHAPE, open_body
+from avatar.checks import AvatarError
+from avatar.io.bvh import BvhMotion
+from avatar.records import Motion
+
+# Our joint: what Mixamo, CMU and LAFAN skeletons call it, lower case, without prefix, spaces or signs.
+NAMES = {
+    "pelvis": ("hips", "pelvis", "root"),
+    "neck": ("neck",),
+    "head": ("head",),
+    **{
+        ours.format(side=side): tuple(name.format(side=side, s=side[0]) for name in theirs)
+        for side in ("left", "right")
+        for ours, theirs in {
+            "{side}_hip": ("{side}upleg", "{side}thigh", "{s}thigh", "{side}hip"),
+            "{side}_knee": ("{side}leg", "{side}shin", "{s}shin", "{side}lowleg", "{side}knee"),
+            "{side}_ankle": ("{side}foot", "{s}foot", "{side}ankle"),
+            "{side}_foot": ("{side}toebase", "{side}toe", "{s}toe"),
+            "{side}_collar": ("{side}shoulder", "{side}collar", "{s}clavicle", "{s}collar"),
+            "{side}_shoulder": ("{side}arm", "{side}uparm", "{side}upperarm", "{s}upperarm"),
+            "{side}_elbow": ("{side}forearm", "{side}lowarm", "{s}forearm", "{side}elbow"),
+            "{side}_wrist": ("{side}hand", "{s}hand", "{side}wrist"),
+        }.items()
+    },
+}
+NEEDED = [f"{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle", "shoulder", "elbow")]
+LIMBS = [
+    (SMPL_JOINTS.index(f"{side}_{joint}"), SMPL_JOINTS.index(f"{side}_{tip}"))
+    for side in ("left", "right")
+    for joint, tip in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
+]
+NEAR_T_POSE = 65.0  # degrees between a limb at rest and in the T-pose; A-poses pass
+CALIBRATION_FRAMES = 200
+
+
+def retarget(bvh: BvhMotion, name: str) -> Motion:
+    """The motion of a y-up skeleton on our 22 joints.
+
+    Joint rotations in the world are kept, after the difference between the skeleton's rest and the T-pose is taken
+    off. Where the rest is nothing like a T-pose (LAFAN), that difference is what on average lies between the
+    file's rotations and the shortest turns that point our bones along the file's. Joints the skeleton lacks move
+    with their parents. Translations are scaled by the ratio of leg lengths, so the file's units do not matter.
+
+    Raises:
+        AvatarError: naming the joints that were not found by any known name.
+    """
+    source = map_joints(bvh)
+    rest = open_body(MEAN_SHAPE).template.joints.double().numpy()
+    offsets = _rest_positions(bvh)
+    aligned = _aligned_rest(source, rest, offsets)
+    if aligned is None:
+        turns = _calibrated_turns(bvh, source, rest)
+    else:
+        turns = {joint: bvh.rotations[:, index] @ aligned[joint] for joint, index in source.items()}
+    poses = np.zeros((len(bvh.positions), len(SMPL_JOINTS), 3))
+    world = np.zeros((len(bvh.positions), len(SMPL_JOINTS), 3, 3))
+    for joint, parent in enumerate(SMPL_PARENTS):
+        above = world[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), world[:, 0].shape)
+        world[:, joint] = turns.get(joint, above)
+        poses[:, joint] = Rotation.from_matrix(np.swapaxes(above, 1, 2) @ world[:, joint]).as_rotvec()
+    scale = _leg_length(rest, {j: j for j in source}) / _leg_length(offsets, source)
+    translations = scale * bvh.positions[:, source[0]] - rest[0]
+    return Motion(poses.astype(np.float32), translations.astype(np.float32), bvh.fps, name)
+
+
+def map_joints(bvh: BvhMotion) -> dict[int, int]:
+    """Our joint index to the file's, by common names; the joints between hips and neck are shared over the spine."""
+    plain = {re.sub(r"[^a-z0-9]", "", name.rpartition(":")[2].lower()): i for i, name in enumerate(bvh.names)}
+    plain = {re.sub(r"^mixamorig\d*", "", name): index for name, index in plain.items()}
+    found = {}
+    for joint, names in NAMES.items():
+        index = next((plain[name] for name in names if name in plain), None)
+        if index is not None:
+            found[SMPL_JOINTS.index(joint)] = index
+    found.setdefault(0, 0)
+    missing = [joint for joint in NEEDED if SMPL_JOINTS.index(joint) not in found]
+    if missing:
+        raise AvatarError(
+            f"joints: expected the names of a Mixamo, CMU or LAFAN skeleton, found none for {', '.join(missing)} "
+            f"among {', '.join(bvh.names[:40])}."
+        )
+    upper = found.get(SMPL_JOINTS.index("neck"), found[SMPL_JOINTS.index("left_shoulder")])
+    chain = []
+    while (upper := bvh.parents[upper]) > found[0]:
+        chain.insert(0, upper)
+    chain = [index for index in chain if index not in found.values()]
+    spine = {1: ("spine3",), 2: ("spine1", "spine3")}.get(len(chain), ("spine1", "spine2", "spine3"))
+    found |= {SMPL_JOINTS.index(joint): index for joint, index in zip(reversed(spine), reversed(chain))}
+    return dict(sorted(found.items()))
+
+
+def _mapped_parent(joint: int, source: dict[int, int]) -> int:
+    """The nearest joint above that the skeleton has too; -1 for the root."""
+    parent = SMPL_PARENTS[joint]
+    while parent >= 0 and parent not in source:
+        parent = SMPL_PARENTS[parent]
+    return parent
+
+
+def _rest_positions(bvh: BvhMotion) -> np.ndarray:
+    """Joint positions at rest, the root at the origin."""
+    places = np.zeros_like(bvh.offsets)
+    for joint, parent in enumerate(bvh.parents[1:], start=1):
+        places[joint] = places[parent] + bvh.offsets[joint]
+    return places
+
+
+def _aligned_rest(source: dict[int, int], rest: np.ndarray, offsets: np.ndarray) -> dict[int, np.ndarray] | None:
+    """Rotations ``(3, 3)`` from our T-pose to the skeleton's rest, or None where that is nothing like a T-pose.
+
+    All joints turn to where the skeleton faces. Limbs turn further onto its arms and legs, and hands with them;
+    other bones do not, because where trunk and feet have their joints differs more than how they are held.
+    """
+    left, right = (offsets[source[SMPL_JOINTS.index(f"{side}_hip")]] for side in ("left", "right"))
+    across = left - right
+    facing = Rotation.from_rotvec([0, np.arctan2(-across[2], across[0]), 0]).as_matrix()
+    shoulders = [offsets[source[SMPL_JOINTS.index(f"{side}_shoulder")]] for side in ("left", "right")]
+    if _angle(np.mean(shoulders, axis=0) - (left + right) / 2, np.array([0.0, 1.0, 0.0])) > NEAR_T_POSE:
+        return None
+    aligned = dict.fromkeys(source, facing)
+    for joint, tip in LIMBS:
+        if tip not in source:
+            aligned[joint] = aligned[SMPL_PARENTS[joint]]
+            continue
+        ours, theirs = facing @ (rest[tip] - rest[joint]), offsets[source[tip]] - offsets[source[joint]]
+        if _angle(ours, theirs) > NEAR_T_POSE:
+            return None
+        aligned[joint] = _align(ours[None], theirs[None]) @ facing
+        if SMPL_JOINTS[tip].endswith("wrist"):
+            aligned[tip] = aligned[joint]
+    return aligned
+
+
+def _align(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """The rotation ``(3, 3)`` from our bones to theirs: the shortest for one bone, the best fit for several.
+
+    Bones without length (joints at one place) say nothing and are left out.
+    """
+    lengths = np.linalg.norm(theirs, axis=1)
+    known = lengths > 1e-6 * max(lengths.max(), 1e-12)
+    ours, theirs = (b[known] / np.linalg.norm(b[known], axis=1, keepdims=True) for b in (ours, theirs))
+    if len(ours) == 0:
+        return np.eye(3)
+    if len(ours) > 1:
+        return Rotation.align_vectors(theirs, ours)[0].as_matrix()
+    axis, cosine = np.cross(ours[0], theirs[0]), float(ours[0] @ theirs[0])
+    if np.linalg.norm(axis) < 1e-9:
+        side = np.cross(ours[0], [1.0, 0.0, 0.0] if abs(ours[0, 0]) < 0.9 else [0.0, 1.0, 0.0])
+        return np.eye(3) if cosine > 0 else Rotation.from_rotvec(np.pi * side / np.linalg.norm(side)).as_matrix()
+    angle = np.arctan2(np.linalg.norm(axis), cosine)
+    return Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle).as_matrix()
+
+
+def _calibrated_turns(bvh: BvhMotion, source: dict[int, int], rest: np.ndarray) -> dict[int, np.ndarray]:
+    """World rotations of our joints for a skeleton without a T-pose, from where its joints are."""
+    some = np.unique(np.linspace(0, len(bvh.positions) - 1, CALIBRATION_FRAMES).astype(int))
+    rotations, positions = bvh.rotations[some], bvh.positions[some]
+    pointing: dict[int, np.ndarray] = {-1: np.tile(np.eye(3), (len(some), 1, 1))}
+    turns = {}
+    for joint, index in source.items():
+        pointing[joint] = above = pointing[_mapped_parent(joint, source)]
+        children = [child for child in source if _mapped_parent(child, source) == joint]
+        if children:
+            bones = positions[:, [source[child] for child in children]] - positions[:, index : index + 1]
+            carried = np.einsum("tij,bj->tbi", above, rest[children] - rest[joint])
+            pointing[joint] = np.stack([_align(c, b) for c, b in zip(carried, bones)]) @ above
+        between = np.swapaxes(rotations[:, index], 1, 2) @ pointing[joint]
+        turns[joint] = bvh.rotations[:, index] @ Rotation.from_matrix(between).mean().as_matrix()
+    return turns
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Degrees between two directions."""
+    cosine = a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def _leg_length(places: np.ndarray, source: dict[int, int]) -> float:
+    """Length of the left leg from hip to ankle, over joint positions at rest."""
+    hip, knee, ankle = (places[source[SMPL_JOINTS.index(f"left_{joint}")]] for joint in ("hip", "knee", "ankle"))
+    length = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+    if length < 1e-9:
+        raise AvatarError("joints: expected a leg with some length, got none.")
+    return length

@@ -1,0 +1,163 @@
+"""Poses for the open dataset: random draws to train on, authored sequences (another kind) to test on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.stats import qmc
+
+from avatar.body.model import SMPL_JOINTS, BodyModel
+from avatar.body.open import open_body, open_body_shapes
+from avatar.checks import AvatarError
+from avatar.geometry.surface import vertex_normals
+from avatar.simulate.angles import LIMITS, Angles, pose_from_angles
+from avatar.simulate.sequences import SEQUENCES, authored_motion
+
+CLEARANCE = 0.03  # metres kept between forearms, hands, legs and the rest, so that cloth finds room
+
+
+@dataclass(frozen=True)
+class NamedPose:
+    """One pose of the open dataset: ``name`` is ``<sequence>.<frame>``, ``pose (22, 3)`` axis-angle, radians."""
+
+    name: str
+    pose: np.ndarray
+
+
+def random_angles(count: int, seed: int) -> Angles:
+    """Degrees of freedom of random poses, ``(count,)`` each: broad, correlated as people are, and spread evenly.
+
+    A scrambled Sobol sequence over 27 factors, so that any number of first draws covers the space well. Hips and
+    knees share a squat, a stride and a lifted leg, and with a thigh up the trunk bends less; arms share how far
+    they are raised, and elbows fold as arms come forward.
+    """
+    factors = qmc.Sobol(27, scramble=True, rng=np.random.default_rng(seed)).random(count).T
+    unit = iter(factors)
+    signed = (2 * factor - 1 for factor in unit)
+    angles = {"yaw": 15 * next(signed)}
+    for name in ("trunk_bend", "trunk_twist", "trunk_lean", "head_nod", "head_turn", "head_tilt"):
+        low, high = LIMITS[name]
+        draw = next(signed)
+        angles[name] = np.where(draw > 0, high, -low) * draw * np.abs(draw) ** 0.5
+    squat, stride, lift = next(unit) ** 2.5, next(signed), next(signed)
+    stance, raised, apart = 14 * next(unit) ** 2, next(unit) ** 1.5, next(signed)
+    folded = np.clip(75 * squat + 60 * np.abs(lift) ** 1.5 * (1 - squat), 0, 75) / 75
+    angles["trunk_bend"] = np.where(angles["trunk_bend"] > 0, 1 - 0.6 * folded, 1) * angles["trunk_bend"]
+    for side, mirror in (("left", 1.0), ("right", -1.0)):
+        lifted = np.clip(mirror * lift, 0, None) ** 1.5 * (1 - squat)
+        flexion = 75 * squat + 25 * mirror * stride * (1 - squat) + 60 * lifted
+        knee = 90 * squat + 8 + 65 * next(unit) ** 2 * (1 - squat)
+        arm = np.clip(raised + 0.5 * mirror * apart, 0, 1)
+        forward = next(signed)
+        angles |= {
+            f"{side}_hip_flexion": flexion,
+            f"{side}_knee_flexion": knee,
+            f"{side}_ankle_flexion": (knee - flexion) * (1 - lifted) * 0.8,
+            f"{side}_hip_abduction": 3 + stance + 14 * next(unit) ** 2,
+            f"{side}_hip_turn": 5 + 14 * next(signed),
+            f"{side}_arm_abduction": 24 + 112 * arm,
+            f"{side}_arm_flexion": np.where(forward > 0, 85, 30) * forward * (1 - 0.5 * arm),
+            f"{side}_arm_sweep": 18 + 30 * next(signed),
+            f"{side}_elbow_flexion": 8 + 75 * next(unit) ** 1.5 + 25 * np.clip(forward, 0, 1),
+            f"{side}_forearm_turn": 30 * next(signed),
+        }
+    return angles
+
+
+def draw_poses(count: int, seed: int, kind: str) -> list[NamedPose]:
+    """Poses of one kind, none of which makes an open body touch itself.
+
+    ``train``: random draws (``random.<number>``). ``test``: frames of the authored sequences, spread over each of
+    them (``walk.<frame>``); these are motions people make, which no random draw repeats.
+
+    Args:
+        count: how many, at least 1; seed: the same seed gives the same poses, whatever was drawn before.
+        kind: train or test.
+
+    Raises:
+        AvatarError: for an unknown kind or a count that cannot be met.
+    """
+    if kind not in ("train", "test"):
+        raise AvatarError(f"kind: expected train or test, got {kind!r}.")
+    if count < 1:
+        raise AvatarError(f"count: expected at least 1 pose, got {count}.")
+    return _random_poses(count, seed) if kind == "train" else _authored_poses(count, seed)
+
+
+def _random_poses(count: int, seed: int) -> list[NamedPose]:
+    """The first ``count`` random draws that are clear of themselves."""
+    drawn = 1 << int(np.ceil(np.log2(count * 1.5 + 8)))  # Sobol sequences are balanced at powers of two
+    while drawn <= 64 * (count + 8):
+        poses = pose_from_angles(random_angles(drawn, seed), drawn)
+        kept: list[np.ndarray] = []
+        for part in np.split(poses, range(32, drawn, 32)):
+            kept.extend(part[clear_of_itself(part)])
+            if len(kept) >= count:
+                return [NamedPose(f"random.{i:05d}", pose) for i, pose in enumerate(kept[:count])]
+        drawn *= 2
+    raise AvatarError(f"count: expected poses that do not touch themselves, found too few for {count}.")
+
+
+def _authored_poses(count: int, seed: int) -> list[NamedPose]:
+    """Frames of all sequences in turn, one from each equal stretch of one loop."""
+    rng = np.random.default_rng(seed)
+    drawn = []
+    for place, (name, (period, _)) in enumerate(SEQUENCES.items()):
+        poses = authored_motion(name, seconds=period).poses
+        share = count // len(SEQUENCES) + (place < count % len(SEQUENCES))
+        if share > len(poses):
+            raise AvatarError(f"count: expected at most {len(poses)} frames of {name}, got {share}.")
+        edges = np.arange(share + 1) * len(poses) // max(share, 1)
+        frames = edges[:-1] + (rng.random(share) * np.diff(edges)).astype(int)
+        drawn += [NamedPose(f"{name}.{frame:05d}", poses[frame]) for frame in frames]
+    return drawn
+
+
+@torch.no_grad()
+def clear_of_itself(poses: np.ndarray, clearance: float = CLEARANCE) -> np.ndarray:
+    """Which poses ``(T, 22, 3)`` keep hands, forearms and legs out of the rest of every open body: ``(T,)`` bool.
+
+    Sampled vertices of forearms and hands are tested against head, trunk, legs and the other arm, and those of
+    one leg from mid-thigh down against the other: closer than ``clearance`` metres, or inside, is touching.
+    """
+    clear = np.ones(len(poses), bool)
+    for shape in open_body_shapes():
+        body = open_body(shape)
+        pairs = _touching_parts(body)
+        posed = body(torch.from_numpy(np.ascontiguousarray(poses, np.float32)))
+        normals = vertex_normals(posed.vertices, body.faces)
+        for frame in np.flatnonzero(clear):
+            points, outward = posed.vertices[frame].numpy(), normals[frame].numpy()
+            clear[frame] = not any(_touch(points, outward, *pair, clearance) for pair in pairs)
+    return clear
+
+
+def _touching_parts(body: BodyModel) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Pairs of vertex sets (mover, rest) that must not touch; every third vertex is near enough."""
+    owner = np.array(SMPL_JOINTS)[body.weights.argmax(dim=1).numpy()]
+    sampled = np.arange(len(owner)) % 3 == 0
+    knees = body.template.joints[[SMPL_JOINTS.index("left_knee"), SMPL_JOINTS.index("left_hip")], 1].mean()
+    below = body.template.vertices[:, 1].numpy() < float(knees)
+    parts = {}
+    for side in ("left", "right"):
+        legs = [f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")]
+        parts[side, "hand"] = np.isin(owner, [f"{side}_elbow", f"{side}_wrist"])
+        parts[side, "arm"] = np.isin(owner, [f"{side}_{joint}" for joint in ("collar", "shoulder")])
+        parts[side, "leg"] = np.isin(owner, legs) & below
+    pairs = []
+    for side in ("left", "right"):
+        rest = ~parts[side, "hand"] & ~parts[side, "arm"]
+        pairs.append((parts[side, "hand"] & sampled, rest & sampled))
+    pairs.append((parts["left", "leg"] & sampled, parts["right", "leg"] & sampled))
+    return [(np.flatnonzero(mover), np.flatnonzero(rest)) for mover, rest in pairs]
+
+
+def _touch(points: np.ndarray, normals: np.ndarray, mover: np.ndarray, rest: np.ndarray, clearance: float) -> bool:
+    """Whether any mover vertex is within the clearance of, or behind, the surface of the rest."""
+    distance, nearest = cKDTree(points[rest]).query(points[mover])
+    across = points[mover] - points[rest[nearest]]
+    behind = (across * normals[rest[nearest]]).sum(axis=1) < 0
+    return bool(((distance < clearance) | (behind & (distance < 0.15))).any())

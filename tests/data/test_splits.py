@@ -1,0 +1,64 @@
+"""Held-back frames, fractions and leakage."""
+
+from itertools import pairwise
+from types import SimpleNamespace
+
+import pytest
+
+from avatar.checks import AvatarError
+from avatar.data.splits import SplitConfig, check_leakage, sequence_of, split_frames, split_outfit
+
+
+def frames(**sequences):
+    return [f"{name}.{i:05d}" for name, count in sequences.items() for i in range(count)]
+
+
+def test_whole_sequences_are_held_back_where_there_are_several():
+    names = frames(a=10, b=10, c=10, d=10, e=10)
+    split = split_frames(names, SplitConfig(validation_share=0.2))
+    assert {sequence_of(name) for name in split.validation} == {"e"}
+    assert sorted(split.train + split.validation) == names
+    assert split == split_frames(list(reversed(names)), SplitConfig(validation_share=0.2))
+    assert len(split_frames(names, SplitConfig(validation_share=0.01)).validation) == 10  # never half a sequence
+    uneven = frames(a=3, b=3, c=4, long=90)
+    assert {sequence_of(n) for n in split_frames(uneven, SplitConfig(validation_share=0.05)).validation} == {"c"}
+
+
+def test_frames_are_held_back_where_sequences_are_few():
+    names = frames(random=54)
+    split = split_frames(names, SplitConfig(validation_share=0.1))
+    assert split.validation == tuple(names[-5:])
+    assert split.train == tuple(names[:-5])
+    assert split_frames(names, SplitConfig(validation_share=0)).validation == ()
+
+
+@pytest.mark.parametrize(("fraction", "kept"), [(1.0, 48), (0.5, 24), (0.125, 6), (1 / 3, 16), (0.01, 1)])
+def test_fractions_thin_evenly_and_leave_validation_alone(fraction, kept):
+    names = frames(random=54)
+    whole = split_frames(names, SplitConfig(validation_share=6 / 54))
+    split = split_frames(names, SplitConfig(validation_share=6 / 54, train_fraction=fraction))
+    assert split.validation == whole.validation
+    assert len(split.train) == kept
+    places = [whole.train.index(name) for name in split.train]
+    gaps = {b - a for a, b in pairwise(places)}
+    assert places[0] == 0
+    assert gaps <= {round(1 / fraction)} or not gaps
+
+
+def test_frames_in_train_and_test_are_refused(tiny_outfit):
+    split = split_outfit(tiny_outfit)
+    assert not set(split.train + split.validation) & set(tiny_outfit.frames("test"))
+    assert len(split.train + split.validation) == 6
+    with pytest.raises(AvatarError, match=r"tiny: .* 1 are in both \(b\)"):
+        check_leakage(["a", "b"], ["b", "c"], "tiny")
+    leaking = SimpleNamespace(name="x", path=tiny_outfit.path, frames=lambda split: ("a.1", "a.2"))
+    with pytest.raises(AvatarError, match="2 are in both"):
+        split_outfit(leaking)
+
+
+def test_bad_shares_are_refused():
+    for bad in ({"validation_share": 1.0}, {"train_fraction": 0.0}, {"validation_share": -0.1}, {"train_fraction": 2}):
+        with pytest.raises(AvatarError, match="expected at least 0 and below 1"):
+            SplitConfig(**bad)
+    with pytest.raises(AvatarError, match="frames left to train on"):
+        split_frames(["a.1"], SplitConfig())

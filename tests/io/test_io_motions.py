@@ -1,0 +1,285 @@
+"""Motion files: AMASS, our own, BVH; conventions, resampling and broken files."""
+
+import logging
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
+from avatar.body.open import open_body
+from avatar.checks import AvatarError, DataError
+from avatar.io.motions import read_motion, resample_motion, write_motion
+from avatar.io.npz import write_arrays
+from avatar.records import Motion
+from avatar.simulate.sequences import authored_motion
+
+LEFT_RIGHT = {
+    "hip": "UpLeg",
+    "knee": "Leg",
+    "ankle": "Foot",
+    "foot": "ToeBase",
+    "collar": "Shoulder",
+    "shoulder": "Arm",
+    "elbow": "ForeArm",
+    "wrist": "Hand",
+}
+MIXAMO = {"pelvis": "Hips", "spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2", "neck": "Neck", "head": "Head"}
+MIXAMO |= {f"{s}_{ours}": f"{s.title()}{theirs}" for s in ("left", "right") for ours, theirs in LEFT_RIGHT.items()}
+
+
+@pytest.fixture(scope="module")
+def walk():
+    motion = authored_motion("walk", fps=30, seconds=1.5)
+    travel = np.linspace(0, 1, len(motion.poses))[:, None] * [0.1, 0.02, 0.8]
+    return Motion(motion.poses, travel.astype(np.float32), 30.0, "walk")
+
+
+def assert_same_poses(a, b, degrees=0.01):
+    turned = Rotation.from_rotvec(a.reshape(-1, 3)).inv() * Rotation.from_rotvec(b.reshape(-1, 3))
+    assert np.degrees(turned.magnitude()).max() < degrees
+
+
+def write_bvh(
+    path, motion, frames=None, scale=100.0, prefix="mixamorig:", order="ZXY", basis=None, names=None, rest=None
+):
+    """A BVH file of a motion on the open body's skeleton.
+
+    ``frames (J, 3, 3)`` turns each joint's own frame at rest (LAFAN has such); ``basis`` turns the whole world;
+    ``rest (J, 3)`` are other joint positions.
+    """
+    rest = open_body("mean").template.joints.double().numpy() if rest is None else rest
+    frames = np.tile(np.eye(3), (22, 1, 1)) if frames is None else frames
+    basis = np.eye(3) if basis is None else basis
+    names = MIXAMO if names is None else names
+    count = len(motion.poses)
+    world = np.zeros((count, 22, 3, 3))
+    for joint, parent in enumerate(SMPL_PARENTS):
+        own = Rotation.from_rotvec(motion.poses[:, joint]).as_matrix()
+        world[:, joint] = own if parent < 0 else world[:, parent] @ own
+    world = basis @ world @ basis.T @ frames
+    lines, columns = ["HIERARCHY"], []
+
+    def put(joint, depth):
+        parent, tab = SMPL_PARENTS[joint], "  " * depth
+        offset = np.zeros(3) if parent < 0 else frames[parent].T @ basis @ (rest[joint] - rest[parent])
+        lines.extend([f"{tab}{'ROOT' if parent < 0 else 'JOINT'} {prefix}{names[SMPL_JOINTS[joint]]}", f"{tab}{{"])
+        lines.append(f"{tab}OFFSET {' '.join(str(float(v * scale)) for v in offset)}")
+        spin = " ".join(f"{axis}rotation" for axis in order)
+        lines.append(f"{tab}CHANNELS " + (f"6 Xposition Yposition Zposition {spin}" if parent < 0 else f"3 {spin}"))
+        if parent < 0:
+            columns.append((motion.translations + rest[0]) @ basis.T * scale)
+        local = world[:, joint] if parent < 0 else np.swapaxes(world[:, parent], 1, 2) @ world[:, joint]
+        columns.append(Rotation.from_matrix(local).as_euler(order, degrees=True))
+        children = [c for c, p in enumerate(SMPL_PARENTS) if p == joint]
+        for child in children:
+            put(child, depth + 1)
+        if not children:
+            lines.extend([f"{tab}End Site", f"{tab}{{", f"{tab}OFFSET 0 1 0", f"{tab}}}"])
+        lines.append(f"{tab}}}")
+
+    put(0, 0)
+    lines += ["MOTION", f"Frames: {count}", f"Frame Time: {1 / motion.fps:.8f}"]
+    lines += [" ".join(f"{value:.9f}" for value in row) for row in np.concatenate(columns, axis=1)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_our_own_file_round_trips(tmp_path, walk):
+    write_motion(tmp_path / "walk.npz", walk)
+    read = read_motion(tmp_path / "walk.npz")
+    np.testing.assert_array_equal(read.poses, walk.poses)
+    np.testing.assert_array_equal(read.translations, walk.translations)
+    assert (read.fps, read.name, read.source) == (30.0, "walk", tmp_path / "walk.npz")
+
+
+@pytest.mark.parametrize("kind", ["smplh", "smplx", "smpl"])
+def test_amass_files_stand_up_and_objects_in_them_are_not_touched(tmp_path, walk, kind):
+    """A y-up motion is laid down as AMASS stores it; reading must give it back."""
+    z_from_y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    poses = walk.poses.astype(np.float64).copy()
+    poses[:, 0] = Rotation.from_matrix(z_from_y @ Rotation.from_rotvec(poses[:, 0]).as_matrix()).as_rotvec()
+    flat = poses.reshape(len(poses), 66)
+    trans = walk.translations @ z_from_y.T
+    if kind == "smplx":
+        arrays = {"root_orient": flat[:, :3], "pose_body": flat[:, 3:], "mocap_frame_rate": np.array(30.0)}
+    else:
+        width = {"smplh": 90, "smpl": 6}[kind]
+        full = np.concatenate([flat, np.full((len(flat), width), 0.3)], axis=1)
+        arrays = {"poses": full, "mocap_framerate": np.array(30)}
+    labels = np.array([{"marker": 1}], dtype=object)
+    np.savez(tmp_path / "amass.npz", trans=trans, gender=np.array("female"), labels=labels, **arrays)
+    read = read_motion(tmp_path / "amass.npz")
+    assert_same_poses(read.poses, walk.poses)
+    np.testing.assert_allclose(read.translations, walk.translations, atol=1e-6)
+    assert read.fps == 30.0
+    lying = read_motion(tmp_path / "amass.npz", up="y")
+    np.testing.assert_allclose(lying.translations, trans, atol=1e-6)
+
+
+@pytest.mark.parametrize(("order", "scale"), [("ZXY", 100.0), ("XYZ", 1.0), ("YZX", 39.37)])
+def test_bvh_in_any_order_and_unit_gives_the_motion_back(tmp_path, walk, order, scale, caplog):
+    path = write_bvh(tmp_path / "walk.bvh", walk, order=order, scale=scale)
+    with caplog.at_level(logging.INFO):
+        read = read_motion(path)
+    assert_same_poses(read.poses, walk.poses)
+    np.testing.assert_allclose(read.translations, walk.translations, atol=1e-5)
+    assert read.fps == pytest.approx(30, abs=1e-4)
+    assert "22 joints of 22 mapped" in caplog.text
+
+
+def test_an_a_pose_at_rest_is_taken_off(tmp_path, walk):
+    """Joint frames turned with the arms of an A-pose: the same motion must come out."""
+    frames = np.tile(np.eye(3), (22, 1, 1))
+    for side, sign in (("left", -1), ("right", 1)):
+        for joint in ("shoulder", "elbow", "wrist"):
+            frames[SMPL_JOINTS.index(f"{side}_{joint}")] = Rotation.from_rotvec([0, 0, -sign * 0.8]).as_matrix()
+    read = read_motion(write_bvh(tmp_path / "walk.bvh", walk, frames=frames))
+    assert_same_poses(read.poses, walk.poses)
+
+
+def test_a_skeleton_with_frames_of_its_own_is_calibrated_from_where_its_joints_are(tmp_path):
+    """LAFAN files have no T-pose at zero; directions must come out right, twist on average."""
+    motion = authored_motion("dance", fps=30, seconds=6)
+    frames = Rotation.random(22, rng=np.random.default_rng(0)).as_matrix()
+    read = read_motion(write_bvh(tmp_path / "dance.bvh", motion, frames=frames, prefix=""))
+    body = open_body("mean")
+    place = [np.asarray(body_joints(m.poses, body)) for m in (read, motion)]
+    assert np.linalg.norm(place[0] - place[1], axis=-1).mean() < 0.06
+    assert np.linalg.norm(place[0] - place[1], axis=-1).max() < 0.25
+
+
+def body_joints(poses, body):
+    """Posed joint positions ``(T, 22, 3)``."""
+    rest = body.template.joints.numpy()
+    turned, places = [], []
+    for joint, parent in enumerate(SMPL_PARENTS):
+        own = Rotation.from_rotvec(poses[:, joint])
+        turned.append(own if parent < 0 else turned[parent] * own)
+        here = np.tile(rest[joint], (len(poses), 1))
+        places.append(here if parent < 0 else places[parent] + turned[parent].apply(rest[joint] - rest[parent]))
+    return np.stack(places, axis=1)
+
+
+def test_other_proportions_change_no_rotation(tmp_path, walk):
+    """CMU hips sit low and forward of the pelvis, collars and neck at the spine, legs are spread."""
+    rest = open_body("mean").template.joints.double().numpy()
+    rest = rest.copy()
+    legs = [SMPL_JOINTS.index(f"left_{j}") for j in ("hip", "knee", "ankle", "foot")]
+    legs += [SMPL_JOINTS.index(f"right_{j}") for j in ("hip", "knee", "ankle", "foot")]
+    rest[legs] += [0, -0.08, 0.05]
+    for joint in ("neck", "left_collar", "right_collar"):
+        rest[SMPL_JOINTS.index(joint)] = rest[SMPL_JOINTS.index("spine3")]
+    assert_same_poses(read_motion(write_bvh(tmp_path / "a.bvh", walk, rest=rest)).poses, walk.poses)
+
+
+def test_skeletons_that_face_elsewhere_are_turned(tmp_path, walk):
+    """A rest pose looking along x: the same person in the world, so the same motion."""
+    turned = Rotation.from_rotvec([0, np.pi / 2, 0]).as_matrix()
+    frames = np.tile(turned.T, (22, 1, 1))
+    assert_same_poses(read_motion(write_bvh(tmp_path / "a.bvh", walk, frames=frames)).poses, walk.poses)
+
+
+def test_z_up_bvh_is_refused_until_named_and_then_stands(tmp_path, walk):
+    basis = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    path = write_bvh(tmp_path / "walk.bvh", walk, basis=basis)
+    with pytest.raises(DataError, match=r"upright along z.*up='z'"):
+        read_motion(path)
+    read = read_motion(path, up="z")
+    assert_same_poses(read.poses, walk.poses)
+    np.testing.assert_allclose(read.translations, walk.translations, atol=1e-5)
+
+
+def test_common_skeletons_are_mapped(tmp_path, walk):
+    cmu = {**MIXAMO, "spine1": "LowerBack", "spine2": "Spine", "spine3": "Spine1"}
+    lafan = {**MIXAMO, "left_foot": "LeftToe", "right_foot": "RightToe"}
+    for names in (cmu, lafan):
+        read = read_motion(write_bvh(tmp_path / "a.bvh", walk, names=names, prefix=""))
+        assert_same_poses(read.poses, walk.poses)
+    names = {**MIXAMO, "left_elbow": "Tentacle"}
+    with pytest.raises(DataError, match=r"a\.bvh: joints: expected the names of a Mixamo.*none for left_elbow"):
+        read_motion(write_bvh(tmp_path / "a.bvh", walk, names=names))
+
+
+def test_resampling_agrees_with_scipy_and_keeps_the_ends(walk):
+    read = resample_motion(walk, 72.5)
+    times = np.arange(len(read.poses)) / 72.5
+    assert times[-1] <= (len(walk.poses) - 1) / 30 < times[-1] + 1 / 72.5
+    for joint in (0, 4, 16):
+        known = Slerp(np.arange(len(walk.poses)) / 30, Rotation.from_rotvec(walk.poses[:, joint]))(times)
+        assert np.degrees((known.inv() * Rotation.from_rotvec(read.poses[:, joint])).magnitude()).max() < 1e-3
+    known = np.interp(times, np.arange(len(walk.poses)) / 30, walk.translations[:, 2])
+    np.testing.assert_allclose(read.translations[:, 2], known, atol=1e-6)
+    again = resample_motion(walk, 30)
+    np.testing.assert_allclose(again.poses, walk.poses, atol=1e-6)
+    single = resample_motion(Motion(walk.poses[:1], walk.translations[:1], 30.0, "one"), 60)
+    np.testing.assert_allclose(single.poses, walk.poses[:1], atol=1e-6)
+
+
+def test_slerp_takes_the_short_way_across_half_a_turn():
+    poses = np.zeros((2, 22, 3), np.float32)
+    poses[:, 0, 1] = np.radians([170, -170])
+    middle = resample_motion(Motion(poses, np.zeros((2, 3), np.float32), 1.0, "turn"), 2).poses[1, 0]
+    assert abs(np.degrees(middle[1])) == pytest.approx(180, abs=0.01)
+
+
+def smplh(**changes):
+    arrays = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "mocap_framerate": np.array(60.0)}
+    return {key: value for key, value in {**arrays, **changes}.items() if value is not None}
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (smplh(poses=np.zeros((4, 22, 3, 3))), r"poses: expected shape \(T, P\)"),
+        (smplh(poses=np.zeros((4, 63))), "expected poses .T, 66 or more"),
+        (smplh(poses=np.zeros((3, 156))), r"poses: expected shape \(T, P\) with T=4"),
+        (smplh(poses=np.full((4, 156), 90.0)), "expected radians"),
+        (smplh(poses=np.full((4, 156), np.nan)), "poses: expected finite"),
+        (smplh(poses=None), "got neither"),
+        (smplh(trans=None), "expected the keys trans"),
+        (smplh(mocap_framerate=None), "expected mocap_framerate"),
+        (smplh(mocap_framerate=np.array(0.0)), "1 to 1000 frames per second"),
+        (smplh(poses=np.zeros((0, 156)), trans=np.zeros((0, 3))), "at least one frame"),
+        ({"format": np.array("motion/9")}, "expected the keys"),
+    ],
+)
+def test_unsound_npz_files_are_one_error(tmp_path, arrays, message):
+    write_arrays(tmp_path / "a.npz", arrays)
+    with pytest.raises(DataError, match=message) as caught:
+        read_motion(tmp_path / "a.npz")
+    assert "a.npz" in str(caught.value)
+
+
+def test_damaged_bvh_files_are_one_error(tmp_path, walk):
+    text = write_bvh(tmp_path / "walk.bvh", walk).read_text()
+    rng = np.random.default_rng(0)
+    broken = [text[: rng.integers(len(text))] for _ in range(40)]
+    broken += [text.replace("Frames: 45", "Frames: 44"), text.replace("OFFSET", "OFSET", 1), "", "\0\1", "HIERARCHY"]
+    broken += [text.replace("Xrotation", "Wrotation", 1), text.replace("Frame Time: 0.0", "Frame Time: nan ")]
+    broken += [text.replace("CHANNELS 3", "CHANNELS 99999999", 1), text.replace("}", "", 1)]
+    for number, content in enumerate(broken):
+        (tmp_path / "b.bvh").write_text(content)
+        with pytest.raises(DataError):
+            read_motion(tmp_path / "b.bvh")
+            pytest.fail(f"accepted damage {number}")
+    (tmp_path / "b.bvh").write_bytes(b"HIERARCHY \xff\xfe")
+    with pytest.raises(DataError, match="not text"):
+        read_motion(tmp_path / "b.bvh")
+
+
+def test_bad_requests_are_refused(tmp_path, walk):
+    write_motion(tmp_path / "walk.npz", walk)
+    for call, message in (
+        (lambda: read_motion(tmp_path / "none.npz"), "there is none"),
+        (lambda: read_motion(tmp_path / "none.bvh"), "there is none"),
+        (lambda: read_motion(tmp_path / "walk.fbx"), "ending in .npz or .bvh"),
+        (lambda: read_motion(tmp_path / "walk.npz", up="x"), "up: expected y, z"),
+        (lambda: read_motion(tmp_path / "walk.npz", fps=0), "fps: expected 1 to 1000"),
+        (
+            lambda: write_motion(tmp_path / "a.npz", Motion(walk.poses, walk.translations[:3], 30.0, "x")),
+            "translations",
+        ),
+    ):
+        with pytest.raises(AvatarError, match=message):
+            call()
