@@ -1,0 +1,114 @@
+"""Scores as tidy rows on disk: one file of means that tables are made of, and one of single frames beside it."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass, field, fields
+from pathlib import Path
+from typing import TypeVar, get_type_hints
+
+from avatar.checks import DataError
+from avatar.io.npz import write_whole
+
+Row = TypeVar("Row", "Score", "FrameScore")
+
+
+@dataclass(frozen=True)
+class Score:
+    """One number of a results table: a metric's mean over the frames of one outfit for one method.
+
+    ``variant`` tells settings of a method apart, ``seed``, ``steps`` and ``seconds`` are those of its training,
+    ``points`` is the mean count of predicted points, ``commit`` the code that made it.
+    """
+
+    table: str
+    outfit: str
+    method: str
+    variant: str
+    metric: str
+    value: float
+    unit: str
+    frames: int
+    seed: int
+    steps: int
+    seconds: float
+    points: int
+    commit: str
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """One metric of one method on one frame."""
+
+    outfit: str
+    method: str
+    variant: str
+    seed: int
+    frame: str
+    metric: str
+    value: float
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Means and the single frames behind them. Adding two joins them."""
+
+    rows: list[Score] = field(default_factory=list)
+    frames: list[FrameScore] = field(default_factory=list)
+
+    def __add__(self, other: Scores) -> Scores:
+        return Scores(self.rows + other.rows, self.frames + other.frames)
+
+
+def write_scores(path: str | Path, scores: Scores) -> None:
+    """Writes the means to a CSV and the single frames to ``<stem>.frames.csv`` beside it, both whole or not at all.
+
+    Numbers are written so that reading gives back the same bits.
+    """
+    path = Path(path)
+    write_whole(path, _to_csv(Score, scores.rows))
+    write_whole(frames_path(path), _to_csv(FrameScore, scores.frames))
+
+
+def read_scores(path: str | Path) -> Scores:
+    """Reads what `write_scores` wrote; the file of single frames may be missing.
+
+    Raises:
+        DataError: naming the file and what is wrong: missing, other columns, or a value of the wrong kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(path, "there are no scores here.", "Run tools/evaluate.py first.")
+    beside = frames_path(path)
+    return Scores(_from_csv(Score, path), _from_csv(FrameScore, beside) if beside.is_file() else [])
+
+
+def frames_path(path: Path) -> Path:
+    """Where the single frames of a scores file stand."""
+    return path.with_name(f"{path.stem}.frames.csv")
+
+
+def _to_csv(kind: type[Row], rows: Iterable[Row]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([f.name for f in fields(kind)])
+    writer.writerows(astuple(row) for row in rows)
+    return text.getvalue().encode()
+
+
+def _from_csv(kind: type[Row], path: Path) -> list[Row]:
+    columns = get_type_hints(kind)
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        missing = [name for name in columns if name not in (reader.fieldnames or [])]
+        if missing:
+            raise DataError(path, f"expected the columns {', '.join(columns)}; {', '.join(missing)} missing.")
+        rows = []
+        for line in reader:
+            try:
+                rows.append(kind(**{name: parse(line[name]) for name, parse in columns.items()}))
+            except (TypeError, ValueError) as error:
+                raise DataError(path, f"line {reader.line_num} cannot be read ({error}).") from error
+    return rows

@@ -1,0 +1,257 @@
+"""Scoring of predictions on disk, one PLY a frame, whoever made them."""
+
+from __future__ import annotations
+
+import logging
+import zlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from avatar.checks import AvatarError, DataError, require
+from avatar.evaluation.comparison import Comparison
+from avatar.evaluation.metrics import METRICS, Metric, find_metrics
+from avatar.evaluation.scores import FrameScore, Score, Scores
+from avatar.io.meshes import read_mesh
+from avatar.io.points import read_points
+from avatar.records import Frame, Mesh, PointCloud, Scan
+
+log = logging.getLogger(__name__)
+
+SIZE_RATIO = 5.0  # a prediction this many times larger or smaller than its scan is in other units
+
+
+class Outfit(Protocol):
+    """What scoring asks of a dataset's outfit.
+
+    It may also have ``template`` (with ``faces``), which penetration and the body floor need, and
+    ``resample(split, name, points, seed) -> Scan``, a fresh sampling of the true surface for the sampling floor.
+    """
+
+    name: str
+    dataset: str
+
+    def frames(self, split: str) -> Sequence[str]:
+        """Names of the frames of a split."""
+
+    def load(self, split: str, name: str) -> Frame:
+        """One frame."""
+
+
+@dataclass
+class ScoreConfig:
+    """How predictions are scored.
+
+    The same scan points are drawn for every method: a frame's draw depends on ``seed`` and its name alone.
+    """
+
+    scan_points: int = 40_000  # scan points compared a frame; all of them where a scan has fewer
+    metrics: list[str] = field(default_factory=lambda: list(METRICS))
+    seed: int = 0
+    motion: bool = False  # frames follow each other in time and predictions keep point order: adds jitter
+
+    def __post_init__(self):
+        if self.scan_points < 1:
+            raise AvatarError(f"scan_points: expected at least 1, got {self.scan_points}.")
+        find_metrics(self.metrics)
+
+
+@dataclass(frozen=True)
+class Label:
+    """Who made the predictions: the columns of a score that scoring cannot know."""
+
+    method: str
+    table: str = ""
+    variant: str = ""
+    seed: int = 0
+    steps: int = 0
+    seconds: float = 0.0
+    commit: str = ""
+
+
+def score_predictions(
+    folder: str | Path,
+    outfit: Outfit,
+    split: str,
+    config: ScoreConfig,
+    label: Label,
+    meshes: str | Path | None = None,
+) -> Scores:
+    """Scores a folder of predictions, ``<frame>.ply`` with normals for every frame of the split.
+
+    Args:
+        folder: the predictions. Files that belong to no frame are ignored with a warning.
+        outfit: where the true frames come from.
+        split: which of its splits.
+        config: metrics and point counts.
+        label: method, variant and training facts for the rows.
+        meshes: a folder of predicted meshes, ``<frame>.ply`` or ``.obj``, which s2m_cm and normal_consistency then
+            measure instead of the points; None for point methods.
+
+    Returns:
+        `Scores`: one row a metric, and the single frames.
+
+    Raises:
+        DataError: when frames have no prediction (naming them), or one is in other units than its scan.
+        AvatarError: naming the frame, when a prediction is not sound.
+    """
+    names = frame_names(outfit, split)
+    clouds = _find_files(Path(folder), names, (".ply",))
+    surfaces = _find_files(Path(meshes), names, (".ply", ".obj")) if meshes is not None else {}
+
+    def compare(frame: Frame) -> Comparison:
+        path = clouds[frame.name]
+        prediction, scan = read_points(path), draw_scan(frame, config)
+        _check_size(path, prediction, scan)
+        mesh = read_mesh(surfaces[frame.name]) if surfaces else None
+        return Comparison(prediction, scan, posed_body(outfit, frame), mesh)
+
+    return score_frames(outfit, split, names, config, label, compare)
+
+
+def posed_body(outfit: Outfit, frame: Frame) -> Mesh | None:
+    """The bare body under a frame as a mesh, or None where the outfit has no template to take faces from."""
+    template = getattr(outfit, "template", None)
+    return None if template is None else Mesh(frame.body.vertices, np.asarray(template.faces))
+
+
+def draw_scan(frame: Frame, config: ScoreConfig) -> Scan:
+    """The scan points a frame is scored against: a random subset, the same for every method."""
+    count = len(frame.scan.points)
+    if count <= config.scan_points:
+        return frame.scan
+    chosen = frame_generator(frame.name, config.seed).permutation(count)[: config.scan_points]
+    return pick_points(frame.scan, np.sort(chosen))
+
+
+def pick_points(scan: Scan, ids: np.ndarray) -> Scan:
+    """Some of a scan's points, with their normals alone."""
+    return Scan(scan.points[ids], scan.normals[ids])
+
+
+def frame_generator(name: str, seed: int) -> np.random.Generator:
+    """Random state that depends on a frame's name and a seed, not on the frames before it."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def frame_names(outfit: Outfit, split: str) -> list[str]:
+    """The names of a split's frames; a split without any is an error."""
+    names = list(outfit.frames(split))
+    if not names:
+        raise AvatarError(f"split: outfit {outfit.name} has no frames in {split!r}.")
+    return names
+
+
+def _find_files(folder: Path, names: list[str], suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """The file of every frame. Missing ones are an error that names them, extra ones a warning."""
+    if not folder.is_dir():
+        raise DataError(folder, "there is no such folder of predictions.", "Run tools/predict.py first.")
+    there = {path.name: path for path in sorted(folder.iterdir()) if path.suffix in suffixes}
+    found = {name: there.pop(f"{name}{suffix}") for name in names for suffix in suffixes if f"{name}{suffix}" in there}
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise DataError(
+            folder,
+            f"{len(missing)} of {len(names)} frames have no prediction ({', '.join(suffixes)}): {_some(missing)}.",
+            "Predict them, or score the split that was predicted.",
+        )
+    if there:
+        log.warning("%s: ignored %d files that belong to no frame: %s.", folder, len(there), _some(there))
+    return found
+
+
+def _some(names: Iterable[str]) -> str:
+    names = list(names)
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _check_size(path: Path, prediction: PointCloud, scan: Scan) -> None:
+    ratio = np.ptp(prediction.points, axis=0).max() / max(float(np.ptp(scan.points, axis=0).max()), 1e-12)
+    if not 1 / SIZE_RATIO < ratio < SIZE_RATIO:
+        raise DataError(
+            path, f"expected a prediction about as large as its scan, got {ratio:.3g} times its size.", "Use metres."
+        )
+
+
+def score_frames(
+    outfit: Outfit,
+    split: str,
+    names: list[str],
+    config: ScoreConfig,
+    label: Label,
+    compare: Callable[[Frame], Comparison],
+) -> Scores:
+    """Every metric of every frame, and their means.
+
+    ``compare`` makes the `Comparison` of a frame. Errors it or a metric raises are passed on with the frame's name.
+    """
+    metrics = [m for m in find_metrics(config.metrics) if not m.needs_body or getattr(outfit, "template", None)]
+    if len(metrics) < len(config.metrics):
+        log.warning("%s: no template, so penetration into the body is not scored.", outfit.name)
+    frames: list[FrameScore] = []
+    counts, window = [], []
+    for name in require("tqdm").tqdm(
+        sorted(names, key=_in_time), desc=f"{label.method} on {outfit.name}", disable=None
+    ):
+        try:
+            comparison = compare(outfit.load(split, name))
+            values = {m.name: m.measure(comparison) for m in metrics if not m.sequential}
+            if config.motion:
+                window = [*window, (name, comparison.points)][-3:]
+                values |= _measure_sequence([m for m in metrics if m.sequential], window)
+        except DataError:
+            raise
+        except AvatarError as error:
+            raise AvatarError(f"outfit {outfit.name}, {label.method}, frame {name}: {error}") from error
+        counts.append(len(comparison.points))
+        frames += [
+            FrameScore(outfit.name, label.method, label.variant, label.seed, name, metric, float(value))
+            for metric, value in values.items()
+        ]
+    return Scores(_means(frames, metrics, label, round(float(np.mean(counts)))), frames)
+
+
+def _in_time(name: str) -> tuple[str, int, str]:
+    sequence, _, number = name.rpartition(".")
+    return sequence, int(number) if number.isdecimal() else 0, name
+
+
+def _measure_sequence(metrics: list[Metric], window: list[tuple[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+    """Metrics of motion at the last of three frames, where these follow each other in one sequence."""
+    sequences, numbers = zip(*(name.rpartition(".")[::2] for name, _ in window))
+    follow = len(window) == 3 and len(set(sequences)) == 1 and all(number.isdecimal() for number in numbers)
+    if not follow or [int(n) - int(numbers[0]) for n in numbers] != [0, 1, 2]:
+        return {}
+    clouds = [points for _, points in window]
+    if len({len(points) for points in clouds}) > 1:
+        raise AvatarError(f"motion: expected one point count a sequence, got {[len(points) for points in clouds]}.")
+    return {metric.name: metric.measure(torch.stack(clouds)) for metric in metrics}
+
+
+def _means(frames: list[FrameScore], metrics: list[Metric], label: Label, points: int) -> list[Score]:
+    rows = []
+    for metric in metrics:
+        values = [frame.value for frame in frames if frame.metric == metric.name]
+        if values:
+            rows.append(
+                Score(
+                    table=label.table,
+                    outfit=frames[0].outfit,
+                    method=label.method,
+                    variant=label.variant,
+                    metric=metric.name,
+                    value=float(np.mean(values)),
+                    unit=metric.unit,
+                    frames=len(values),
+                    seed=label.seed,
+                    steps=label.steps,
+                    seconds=label.seconds,
+                    points=points,
+                    commit=label.commit,
+                )
+            )
+    return rows
