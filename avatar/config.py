@@ -19,7 +19,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from avatar.checks import AvatarError
 from avatar.nn.methods import METHODS
-from avatar.pipeline import DemoConfig, EvaluateConfig, ExportConfig, MeshConfig, PredictConfig, ReportConfig
+from avatar.pipeline.demo import DemoConfig
+from avatar.pipeline.reporting import ReportConfig
+from avatar.pipeline.scores import EvaluateConfig, PredictConfig
+from avatar.pipeline.surfaces import ExportConfig, MeshConfig
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.simulate.recording import SimulateConfig
 from avatar.training.fitting import FitConfig

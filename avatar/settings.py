@@ -68,6 +68,8 @@ def convert_value(hint: Any, value: Any, name: str) -> Any:
     if origin in (tuple, list) and isinstance(value, (list, tuple)):
         items = [convert_value(inner[0], item, f"{name}[{i}]") for i, item in enumerate(value)]
         return origin(items)
+    if origin in (tuple, list) and not isinstance(value, dict) and inner[0] in (str, Path):
+        return origin([convert_value(inner[0], value, name)])  # outfit=dress stands for outfit=[dress]
     if origin is dict and isinstance(value, dict):
         return {key: convert_value(inner[1], item, f"{name}.{key}") for key, item in value.items()}
     if isinstance(hint, type) and issubclass(hint, Enum):

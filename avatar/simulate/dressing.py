@@ -1,0 +1,215 @@
+"""A dressed body: garments in layers, led from the bind pose to any pose and held there until they rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from avatar.body.model import BodyModel
+from avatar.body.skinning import blend_transforms
+from avatar.checks import AvatarError, check_finite, check_shape
+from avatar.geometry.surface import vertex_normals
+from avatar.geometry.transforms import axis_angle_from_rotation, rotation_from_axis_angle, transform_points
+from avatar.simulate.garments import Garment, cut_garment
+from avatar.simulate.layering import lift_off, tuck
+from avatar.simulate.implicit import smoothing_matrix
+from avatar.simulate.outfits import OutfitConfig
+from avatar.simulate.solver import ClothSolver, Collider, SolverConfig
+
+CLING_GAP = (0.02, 0.045)  # m between cloth and skin over which its cling to the skin fades out
+WAISTBAND_STIFFNESS = 3.0  # N/m a vertex: an elastic waistband stays where it is put
+COVERED_GAP = 0.05  # m: skin nearer than this to a garment is under it
+LEAST_GAP = 0.0015  # m kept between tucked cloth and skin
+LAYER_GAP = 0.012  # m: what a garment's thickness and small folds add to the body under the next one
+
+
+@dataclass
+class TravelConfig:
+    """How a body is led to a pose."""
+
+    stride: float = 0.015  # m: no part of the body moves farther in one step
+    hold: int = 90  # most steps held at the target
+    least_hold: int = 20  # fewest
+    rest_speed: float = 1e-4  # m a step: the 99th percentile of vertex ways at which cloth counts as resting
+    solver: SolverConfig = field(default_factory=SolverConfig)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A garment on its body: anchor weights ``(V, J)`` and stiffness ``(V,)``, and what lies under it.
+
+    ``lift (V,)`` is how far the body's vertices move out to make room for inner garments, metres; ``part`` are
+    the garment's vertices among those of the outfit.
+    """
+
+    garment: Garment
+    weights: torch.Tensor
+    stiffness: np.ndarray
+    lift: torch.Tensor
+    part: slice
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Cloth at the end of a travel: ``cloth (V, 3)`` metres, ``speed`` m a step (99th percentile), ``steps`` taken."""
+
+    cloth: np.ndarray
+    speed: float
+    steps: int
+
+
+def bind_pose(body: BodyModel) -> np.ndarray:
+    """Pose parameters ``(J, 3)`` that put a body into its bind pose, relative to the T-pose."""
+    world = body.zero_from_bind[:, :3, :3].double().transpose(1, 2)
+    local = [world[0]] + [world[p].T @ world[j] for j, p in enumerate(body.parents) if j]
+    return axis_angle_from_rotation(torch.stack(local)).float().numpy()
+
+
+def pose_path(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
+    """Poses ``(count, J, 3)`` on the geodesic of every joint, eased in and out, without the start itself."""
+    a = rotation_from_axis_angle(torch.as_tensor(start, dtype=torch.float64))
+    b = rotation_from_axis_angle(torch.as_tensor(end, dtype=torch.float64))
+    turn = axis_angle_from_rotation(a.transpose(1, 2) @ b)
+    t = torch.arange(1, count + 1, dtype=torch.float64) / count
+    eased = t * t * (3 - 2 * t)
+    return axis_angle_from_rotation(a @ rotation_from_axis_angle(eased[:, None, None] * turn)).float().numpy()
+
+
+class DressedBody:
+    """A body in an outfit, with everything prepared that does not depend on the pose."""
+
+    def __init__(self, body: BodyModel, outfit: OutfitConfig, travel: TravelConfig | None = None):
+        """Cuts the garments, settles them in the bind pose and keeps that as the start of every travel."""
+        self.body, self.outfit, self.travel = body, outfit, travel or TravelConfig()
+        self.garments = [cut_garment(body, config) for config in outfit.garments]
+        sizes = [len(g.vertices) for g in self.garments]
+        self.offsets = np.concatenate([[0], np.cumsum(sizes)])
+        self.faces = np.concatenate([g.faces + o for g, o in zip(self.garments, self.offsets)])
+        self.labels = np.repeat(np.arange(1, len(sizes) + 1), sizes).astype(np.uint8)
+        self.start_pose = bind_pose(body)
+        self.layers = self.make_layers()
+        self.solvers = None
+        self.start = np.concatenate([g.vertices for g in self.garments])
+        still = np.repeat(self.start_pose[None], 1, axis=0)
+        self.start = self.run(still, self.travel.hold).cloth
+
+    def make_layers(self) -> list[Layer]:
+        """Anchors and colliders of all garments, the innermost first."""
+        vertices, faces = self.body.bind_vertices.numpy(), self.body.faces.numpy()
+        lift = np.zeros(len(vertices))
+        spread, _ = smoothing_matrix(faces, len(vertices))
+        layers = []
+        for garment, start in zip(self.garments, self.offsets):
+            gap, ids = cKDTree(vertices).query(garment.vertices)
+            average, rim = smoothing_matrix(garment.faces, len(garment.vertices))
+            weights = self.body.weights.numpy()[ids].astype(np.float64)
+            for _ in range(5):
+                weights = 0.5 * weights + 0.5 * (average @ weights)
+            fade = np.clip((CLING_GAP[1] - gap) / (CLING_GAP[1] - CLING_GAP[0]), 0, 1)
+            stiffness = garment.config.cling * fade
+            if garment.config.waistband:
+                top = garment.vertices[:, 1].max()
+                stiffness[garment.vertices[:, 1] > top - garment.config.waistband] = WAISTBAND_STIFFNESS
+            part = slice(int(start), int(start) + len(garment.vertices))
+            room = torch.from_numpy(lift.copy()).float()
+            layers.append(Layer(garment, torch.from_numpy(weights).float(), stiffness, room, part))
+            lift = lift + LAYER_GAP * covered_skin(vertices, garment)
+            for _ in range(10):
+                lift = spread @ lift
+        return layers
+
+    def make_solvers(self) -> list[ClothSolver]:
+        """A solver a layer, compiled and allocated once."""
+        vertices, faces = self.body.bind_vertices.numpy(), self.body.faces.numpy()
+        return [
+            ClothSolver(
+                layer.garment.vertices,
+                layer.garment.faces,
+                layer.garment.config.fabric,
+                Collider(vertices, faces),
+                layer.stiffness,
+                self.travel.solver,
+            )
+            for layer in self.layers
+        ]
+
+    def under(self, layer: Layer, body_points: torch.Tensor) -> np.ndarray:
+        """What a layer rests on: posed body vertices ``(T, V, 3)``, moved out where inner garments lie."""
+        if not layer.lift.any():
+            return body_points.numpy()
+        normals = vertex_normals(body_points, self.body.faces)
+        return (body_points + layer.lift[:, None] * normals).numpy()
+
+    def posed_body(self, poses: np.ndarray) -> np.ndarray:
+        """Body vertices ``(T, V, 3)`` in poses ``(T, J, 3)``."""
+        return self.body(torch.as_tensor(poses, dtype=torch.float32)).vertices.numpy()
+
+    def settle(self, pose: np.ndarray, stride: float | None = None, via: Sequence[np.ndarray] = ()) -> Rest:
+        """The outfit at rest in a pose, reached from the bind pose, directly or by way of other poses.
+
+        Args:
+            pose: ``(J, 3)`` axis-angle target.
+            stride: farthest way of any body vertex in one step, metres; the configured one if None.
+            via: poses to pass, in order.
+        """
+        check_shape("pose", pose, "J 3", J=len(self.body.parents))
+        check_finite("pose", pose)
+        stops = [self.start_pose, *via, pose]
+        legs = [self.leg(a, b, stride or self.travel.stride) for a, b in zip(stops, stops[1:])]
+        return self.run(np.concatenate(legs), self.travel.hold)
+
+    def leg(self, start: np.ndarray, end: np.ndarray, stride: float) -> np.ndarray:
+        """Poses from one stop to the next, as many as the farthest-moving vertex needs."""
+        sketch = self.posed_body(np.concatenate([start[None], pose_path(start, end, 8)]))
+        way = np.linalg.norm(np.diff(sketch, axis=0), axis=-1).max(1).sum()
+        return pose_path(start, end, max(2, int(np.ceil(1.5 * way / stride))))
+
+    def run(self, poses: np.ndarray, hold: int) -> Rest:
+        """Leads the outfit along poses, then holds the last one until the cloth rests, layer by layer."""
+        if self.solvers is None:
+            self.solvers = self.make_solvers()
+        posed = self.body(torch.as_tensor(np.concatenate([self.start_pose[None], poses]), dtype=torch.float32))
+        motions = posed.joint_transforms[1:] @ self.body.zero_from_bind
+        cloth, speed, steps = self.start.copy(), 0.0, 0
+        for layer, solver in zip(self.layers, self.solvers):
+            under = self.under(layer, posed.vertices)
+            solver.reset(self.start[layer.part], under[0])
+            taken = self.follow(layer, solver, under[1:], motions, hold)
+            cloth[layer.part] = solver.positions
+            speed, steps = max(speed, float(np.percentile(solver.moved, 99))), max(steps, taken)
+        if not np.isfinite(cloth).all():
+            raise AvatarError(f"outfit {self.outfit.name!r}: the solver diverged; use a smaller stride.")
+        return Rest(self.in_order(cloth, posed.vertices[-1].numpy()), speed, steps)
+
+    def in_order(self, cloth: np.ndarray, body_points: np.ndarray) -> np.ndarray:
+        """The outfit's cloth with inner garments under outer ones, outside the body."""
+        faces = self.body.faces.numpy()
+        for above in range(len(self.layers) - 1, 0, -1):
+            outer = self.layers[above]
+            for inner in self.layers[:above]:
+                tucked = tuck(cloth[inner.part], cloth[outer.part], outer.garment.faces)
+                cloth[inner.part] = lift_off(tucked, body_points, faces, LEAST_GAP)
+        return cloth
+
+    def follow(self, layer: Layer, solver: ClothSolver, under: np.ndarray, motions: torch.Tensor, hold: int) -> int:
+        """Leads one layer through ``(T, V, 3)`` colliders and holds it at the last until it rests; counts steps."""
+        rest = torch.as_tensor(layer.garment.vertices, dtype=torch.float32)
+        for points, motion in zip(under, motions):
+            anchors = transform_points(blend_transforms(layer.weights, motion[None])[0], rest).numpy()
+            solver.step(points, anchors)
+        for held in range(hold):
+            solver.step(under[-1], anchors, float(np.clip(2 - 2 * held / hold, 0.1, 1.0)))
+            if held >= self.travel.least_hold and np.percentile(solver.moved, 99) < self.travel.rest_speed:
+                return len(under) + held + 1
+        return len(under) + hold
+
+
+def covered_skin(vertices: np.ndarray, garment: Garment) -> np.ndarray:
+    """Mask ``(V,)`` of body vertices that lie close under a garment."""
+    gap, ids = cKDTree(garment.vertices).query(vertices)
+    _, rim = smoothing_matrix(garment.faces, len(garment.vertices))
+    return (gap < COVERED_GAP) & ~rim[ids]

@@ -1,0 +1,199 @@
+"""Garments cut from the body: an offset surface in the bind pose, hung, clipped and evened out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
+
+from avatar.body.model import BodyModel
+from avatar.checks import AvatarError
+from avatar.geometry.transforms import invert_rigid, transform_points
+from avatar.simulate.implicit import (
+    Grid,
+    clip,
+    collapse_short_edges,
+    compact,
+    drop_ears,
+    flip_edges,
+    largest_component,
+    relax,
+    surface_nets,
+)
+from avatar.simulate.outfits import GarmentConfig
+from avatar.simulate.layering import lift_off
+from avatar.simulate.visibility import body_distances
+
+PAD = 0.12  # metres of free grid around the body
+SHORTEST = 0.45  # shortest edge in the finished mesh, in target edge lengths, before the last relaxation
+BLUR = 0.012  # metres by which the field is smoothed
+CROTCH = 0.06  # metres of gap between the thighs that is bridged softly
+BLEND = 0.03  # metres over which a hanging tube melts into the close-fitting part
+LEVELS = ("left_ankle", "left_knee", "left_hip", "spine1", "spine3", "neck")
+ARM_JOINTS = ("shoulder", "elbow", "wrist")
+
+
+@dataclass(frozen=True)
+class Cutting:
+    """The body a garment is cut on: bind-pose ``vertices``, ``faces``, ``joints`` by name, ``arms (V,)`` weight."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    joints: dict[str, np.ndarray]
+    arms: np.ndarray
+
+    @classmethod
+    def of(cls, body: BodyModel) -> Cutting:
+        """The bind pose of a body."""
+        joints = transform_points(invert_rigid(body.zero_from_bind), body.zero_joints).double().numpy()
+        arm_ids = [body.joint_names.index(f"{side}_{j}") for side in ("left", "right") for j in ARM_JOINTS]
+        return cls(
+            body.bind_vertices.double().numpy(),
+            body.faces.numpy(),
+            dict(zip(body.joint_names, joints)),
+            body.weights[:, arm_ids].sum(dim=1).double().numpy(),
+        )
+
+    def height(self, level: float) -> float:
+        """Height in metres of a level on the body (see `GarmentConfig`)."""
+        return float(np.interp(level, range(len(LEVELS)), [self.joints[name][1] for name in LEVELS]))
+
+    def profile(self, heights: np.ndarray) -> np.ndarray:
+        """Extents ``(H, 3)`` of the trunk and legs at given heights: half width, back, front."""
+        trunk = self.vertices[self.arms < 0.3]
+        rows = []
+        for height in heights:
+            near = trunk[np.abs(trunk[:, 1] - height) < 0.02]
+            rows.append((np.abs(near[:, 0]).max(), near[:, 2].min(), near[:, 2].max()) if len(near) else (0, 0, 0))
+        return np.array(rows)
+
+
+@dataclass(frozen=True)
+class Garment:
+    """A garment mesh in the bind pose: ``vertices (V, 3)`` metres, ``faces (F, 3)``, and its configuration."""
+
+    config: GarmentConfig
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def cut_garment(body: BodyModel, config: GarmentConfig) -> Garment:
+    """Cuts a garment on a body in its bind pose.
+
+    Returns:
+        One connected, consistently wound mesh with every vertex outside the body.
+
+    Raises:
+        AvatarError: when the settings leave nothing to wear.
+    """
+    cutting = Cutting.of(body)
+    grid = garment_field(cutting, config)
+    vertices, faces = surface_nets(grid)
+    vertices = relax(vertices, faces, grid, 6)
+    nearest = cKDTree(cutting.vertices)
+    for cut in cuts(cutting, config):
+        _, ids = nearest.query(vertices)
+        vertices, faces = clip(vertices, faces, cut(vertices, cutting.arms[ids]))
+        if not len(faces):
+            raise AvatarError(f"garment {config.name!r}: the cuts leave nothing; check bottom, top and sleeve.")
+    vertices, faces = largest_component(vertices, faces)
+    vertices, faces = compact(vertices, drop_ears(faces))
+    for _ in range(3):
+        vertices, faces = collapse_short_edges(vertices, faces, SHORTEST * config.edge)
+        faces = flip_edges(vertices, faces)
+        vertices = relax(vertices, faces, grid, 8)
+    return Garment(config, lift_off(vertices, cutting.vertices, cutting.faces, config.fabric.thickness), faces)
+
+
+def garment_field(cutting: Cutting, config: GarmentConfig) -> Grid:
+    """The signed field whose zero level is the uncut garment: the body with ease, melted into a hanging tube."""
+    bottom = cutting.height(config.bottom)
+    spread = 0.0 if config.drop is None else config.flare * (cutting.height(config.drop) - bottom)
+    low, high = cutting.vertices.min(0) - PAD - spread, cutting.vertices.max(0) + PAD + spread
+    low[1] = bottom - PAD / 2
+    axes = [np.arange(low[a], high[a], config.edge) for a in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    flat = points.reshape(-1, 3)
+    reach = 0.1 + max(config.ease, config.sleeve_ease)
+    distance = body_distances(cutting.vertices, cutting.faces, flat, reach)
+    _, ids = cKDTree(cutting.vertices).query(flat)
+    ease = config.ease + (config.sleeve_ease - config.ease) * cutting.arms[ids]
+    field = distance - ease - crotch_fill(cutting, flat)
+    if config.drop is not None:
+        field = smooth_minimum(field, hanging_tube(cutting, config, flat), BLEND)
+    return Grid(gaussian_filter(field.reshape(points.shape[:3]), BLUR / config.edge), low, config.edge)
+
+
+def crotch_fill(cutting: Cutting, points: np.ndarray) -> np.ndarray:
+    """How much to widen the field of ``(N, 3)`` points between the legs, so that trousers bridge the crotch.
+
+    Also keeps the thin gap between the thighs from falling through the grid.
+    """
+    away = [cKDTree(cutting.vertices[cutting.vertices[:, 0] * side > 0]).query(points)[0] for side in (1, -1)]
+    mix = np.clip(0.5 + 0.5 * (away[0] - away[1]) / CROTCH, 0, 1)
+    below = np.clip((cutting.joints["pelvis"][1] - points[:, 1]) / CROTCH, 0, 1)
+    return below * CROTCH * mix * (1 - mix)
+
+
+def hanging_tube(cutting: Cutting, config: GarmentConfig, points: np.ndarray) -> np.ndarray:
+    """Approximate signed distance of ``(N, 3)`` points to cloth hanging straight or flared from the drop level."""
+    start, end = cutting.height(config.drop), cutting.height(config.bottom) - PAD
+    heights = np.arange(start, end, -0.01)
+    profile = cutting.profile(heights)
+    low = cutting.height(0.3) < heights  # feet are no part of what cloth hangs over
+    widest = np.maximum.accumulate(np.where(low, profile[:, 0], 0))
+    back = np.minimum.accumulate(np.where(low, profile[:, 1], 0))
+    front = np.maximum.accumulate(np.where(low, profile[:, 2], 0))
+    spread = config.ease + config.flare * (start - heights)
+    at = [np.interp(-points[:, 1], -heights, row) for row in (widest + spread, back - spread, front + spread)]
+    half_width, half_depth, centre = at[0], (at[2] - at[1]) / 2, (at[2] + at[1]) / 2
+    radius = np.sqrt((points[:, 0] / half_width) ** 2 + ((points[:, 2] - centre) / half_depth) ** 2)
+    return np.maximum((radius - 1) * np.minimum(half_width, half_depth), points[:, 1] - start)
+
+
+def smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
+    """Minimum of two fields, rounded where they meet (polynomial, Quilez)."""
+    mix = np.clip(0.5 + 0.5 * (b - a) / width, 0, 1)
+    return b + (a - b) * mix - width * mix * (1 - mix)
+
+
+def cuts(cutting: Cutting, config: GarmentConfig) -> list:
+    """Functions of ``(vertices, arm weights)`` that are negative where the garment stays, one a cut."""
+    bottom = cutting.height(config.bottom)
+    made = [lambda v, arm: np.where(arm > 0.5, -1.0, bottom - v[:, 1])]
+    if config.top is not None:
+        top = cutting.height(config.top)
+        return [*made, lambda v, arm: v[:, 1] - top]
+    made.append(neckline(cutting, config))
+    for side in ("left", "right"):
+        chain = np.stack([cutting.joints[f"{side}_{joint}"] for joint in ARM_JOINTS])
+        start = min(int(config.sleeve), 1)
+        along = (chain[start + 1] - chain[start]) / np.linalg.norm(chain[start + 1] - chain[start])
+        end = chain[start] + (config.sleeve - start) * (chain[start + 1] - chain[start])
+
+        def sleeve(v, arm, end=end, along=along, sign=np.sign(chain[0, 0])):
+            return np.where((arm > 0.5) & (v[:, 0] * sign > 0), (v - end) @ along, -1.0)
+
+        made.append(sleeve)
+    if config.opening:
+        half = config.opening / 2
+        depth = cutting.joints["neck"][2]
+        made.append(lambda v, arm: np.where((arm < 0.5) & (v[:, 2] > depth), half - np.abs(v[:, 0]), -1.0))
+    return made
+
+
+def neckline(cutting: Cutting, config: GarmentConfig):
+    """The cut of a round neck: an upright elliptic cylinder around the neck, a little deeper in front."""
+    neck, head = cutting.joints["neck"], cutting.joints["head"]
+    (half, back, _), (_, _, front) = cutting.profile(np.array([(neck[1] + head[1]) / 2, neck[1] - 0.085]))
+    back -= 0.012
+    radii = np.array([half + 0.018, (front - back) / 2]) + config.neck
+    centre = (front + back) / 2
+
+    def cut(v, arm):
+        radius = np.hypot(v[:, 0] / radii[0], (v[:, 2] - centre) / radii[1])
+        return np.where(v[:, 1] > neck[1] - 0.15, (1 - radius) * radii.min(), -1.0)
+
+    return cut

@@ -1,0 +1,128 @@
+"""Garments and outfits as plain configuration: what is worn, how it is cut, what cloth it is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from avatar.checks import AvatarError
+
+
+@dataclass
+class FabricConfig:
+    """Cloth as the solver sees it."""
+
+    density: float = 0.2  # kg/m^2
+    stretch: float = 60.0  # N/m along the threads
+    shear: float = 20.0  # N/m
+    bend: float = 1.5e-5  # N m; small values wrinkle finely
+    thickness: float = 0.005  # m kept between cloth vertices and what lies under them
+    friction: float = 0.1  # Coulomb coefficient against skin and inner layers
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not value >= 0:
+                raise AvatarError(f"{name}: expected a number of at least 0, got {value}.")
+
+
+@dataclass
+class GarmentConfig:
+    """One garment, cut on the body in its bind pose.
+
+    Heights are levels on the body, so that one cut fits every shape: 0 ankle, 1 knee, 2 hip, 3 waist, 4 chest,
+    5 neck, with fractions between. A sleeve's length counts 1 to the elbow and 2 to the wrist.
+    """
+
+    name: str
+    bottom: float  # level of the hem
+    top: float | None = None  # level of the upper edge; None ends at a round neckline
+    sleeve: float | None = None  # arm length covered; None where the garment ends below the arms
+    ease: float = 0.012  # m between body and cloth at rest
+    sleeve_ease: float = 0.012  # m, the same along the arms
+    drop: float | None = None  # level from which the cloth hangs as one tube; None follows the body
+    flare: float = 0.0  # m of half width gained per metre below the drop
+    opening: float = 0.0  # m, width of the open front; 0 is closed
+    neck: float = 0.0  # m by which the neckline is lowered
+    edge: float = 0.018  # m, target edge length
+    waistband: float = 0.0  # m of elastic band under the upper edge
+    cling: float = 0.02  # N/m a vertex: elastic pull to its place on the skin where the cloth is tight
+    fabric: FabricConfig = field(default_factory=FabricConfig)
+
+    def __post_init__(self):
+        if not 0.006 <= self.edge <= 0.05:
+            raise AvatarError(f"edge: expected 0.006 to 0.05 m, got {self.edge}.")
+        if self.top is None and self.sleeve is None:
+            raise AvatarError(f"garment {self.name!r}: a garment with a neckline needs a sleeve length.")
+        if not 0 <= self.bottom < (self.top or 5):
+            raise AvatarError(f"garment {self.name!r}: expected bottom below top, got {self.bottom} and {self.top}.")
+
+
+@dataclass
+class OutfitConfig:
+    """Garments worn together, the innermost first."""
+
+    name: str
+    shape: str = "female"
+    garments: list[GarmentConfig] = field(default_factory=list)
+
+
+def trousers(**changes) -> GarmentConfig:
+    """Tight ankle-length trousers held by an elastic waistband."""
+    denim = FabricConfig(density=0.25, stretch=100.0, shear=40.0, bend=5e-5, thickness=0.006)
+    settings = {"bottom": 0.1, "top": 2.75, "ease": 0.011, "edge": 0.0225, "waistband": 0.03, "cling": 0.02}
+    return GarmentConfig("trousers", fabric=denim, **settings | changes)
+
+
+def tee(**changes) -> GarmentConfig:
+    """A close-fitting short-sleeved top."""
+    settings = {"bottom": 2.1, "sleeve": 0.6, "ease": 0.014, "sleeve_ease": 0.016, "edge": 0.016}
+    return GarmentConfig("tee", **settings | changes)
+
+
+GARMENTS = {
+    "tee": lambda: [trousers(), tee()],
+    "shirt": lambda: [
+        trousers(),
+        GarmentConfig(
+            "shirt", bottom=1.6, sleeve=1.85, ease=0.022, sleeve_ease=0.022, drop=3.6, flare=0.06, edge=0.0205
+        ),
+    ],
+    "skirt": lambda: [
+        GarmentConfig(
+            "skirt", bottom=0.85, top=2.8, ease=0.01, drop=2.6, flare=0.22, edge=0.02, waistband=0.03, cling=0.02
+        ),
+        tee(bottom=2.4),
+    ],
+    "dress": lambda: [
+        GarmentConfig("dress", bottom=0.35, sleeve=0.55, ease=0.012, sleeve_ease=0.015, drop=2.7, flare=0.2, edge=0.0225)
+    ],
+    "jacket": lambda: [
+        trousers(edge=0.026),
+        tee(bottom=2.4, sleeve=0.4, ease=0.01, sleeve_ease=0.01, edge=0.022),
+        GarmentConfig(
+            "jacket",
+            bottom=2.0,
+            sleeve=1.85,
+            ease=0.03,
+            sleeve_ease=0.026,
+            drop=3.8,
+            flare=0.03,
+            opening=0.07,
+            neck=0.01,
+            edge=0.02,
+            cling=0.01,
+            fabric=FabricConfig(density=0.3, bend=4e-5),
+        ),
+    ],
+}
+OUTFIT_NAMES = tuple(GARMENTS)
+
+
+def outfit(name: str, shape: str = "female") -> OutfitConfig:
+    """A named outfit on a body shape.
+
+    Raises:
+        AvatarError: for an unknown name, listing those there are.
+    """
+    if name not in GARMENTS:
+        raise AvatarError(f"outfit: expected one of {', '.join(GARMENTS)}, got {name!r}.")
+    return OutfitConfig(name, shape, GARMENTS[name]())

@@ -1,0 +1,104 @@
+"""Every configuration composes and converts; a misspelt option, name or value is refused."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+
+from avatar.checks import AvatarError
+from avatar.config import CONF, VERBS, register, to_settings
+from avatar.nn.methods import find_method
+from avatar.settings import settings_from_dict
+
+ROOT = Path(__file__).parents[1]
+EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
+SIZES = sorted(path.stem for path in (CONF / "size").glob("*.yaml"))
+
+
+def load(verb: str, *overrides: str):
+    register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return to_settings(VERBS[verb], compose(verb, list(overrides)))
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_composes_and_has_its_tool(verb):
+    assert type(load(verb)) is VERBS[verb]
+    assert (ROOT / "tools" / f"{verb}.py").is_file()
+    assert (CONF / f"{verb}.yaml").read_text().startswith(f"# python tools/{verb}.py")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("size", SIZES)
+def test_every_method_and_size_gives_its_settings(method, size):
+    config = load("train", f"method={method}", f"size={size}")
+    chosen = find_method(config.method.name)
+    settings = settings_from_dict(chosen.settings, config.method.settings)
+    assert config.method.variant == method
+    assert config.train.points == {"full": 50_000, "small": 10_000}[size]
+    assert settings.pose == (method != "static")
+    assert settings.template == (method != "csf")
+    assert settings.code_channels == {"full": 64, "small": 16}[size]
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_composes_and_says_how_to_run_it(experiment):
+    load("train", f"experiment={experiment}")
+    first = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()[0]
+    assert first.startswith("# python tools/train.py") and f"experiment={experiment}" in first
+
+
+def test_several_outfits_and_nested_options():
+    config = load("train", "outfit=[dress,tee]", "train.loss.chamfer=plane", "method.settings.pose_noise=0.01")
+    assert config.outfit == ("dress", "tee")
+    assert config.train.loss.chamfer.value == "plane"
+    assert config.method.settings["pose_noise"] == 0.01
+    assert load("train", "outfit=tee").outfit == ("tee",)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("train.stepz=3", "stepz"),
+        ("method=clsoet", "clsoet"),
+        ("train.steps=many", "train.steps: expected int, got 'many'"),
+        ("train.loss.chamfer=round", "expected one of point, plane"),
+        ("train.steps=-1", "steps: expected at least 1"),
+        ("name=../elsewhere", "name: expected a plain name"),
+        ("method.name=closet2", None),
+    ],
+)
+def test_what_is_wrong_is_refused(override, message):
+    if message is None:
+        with pytest.raises(AvatarError, match="expected one of closet"):
+            find_method(load("train", override).method.name)
+        return
+    with pytest.raises((AvatarError, HydraException), match=message):
+        load("train", override)
+
+
+def test_bad_input_ends_in_one_line_and_code_2(tmp_path):
+    command = [
+        sys.executable,
+        "tools/train.py",
+        "dataset=nowhere",
+        f"data_root={tmp_path}",
+        f"hydra.run.dir={tmp_path}",
+    ]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+    assert "expected the folder of data set nowhere" in result.stderr
+
+
+def test_a_multirun_goes_on_after_a_failure_and_names_it(tmp_path):
+    command = [sys.executable, "tools/report.py", "-m", f"run={tmp_path}/one,{tmp_path}/two"]
+    command += [f"hydra.sweep.dir={tmp_path}"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 2
+    assert "2 failed" in result.stderr
+    assert f"run={tmp_path}/one" in result.stderr and f"run={tmp_path}/two" in result.stderr
