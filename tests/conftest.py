@@ -1,10 +1,17 @@
 """Its place puts this folder on the path, so that tests import the slow truths as ``reference``."""
 
+import shutil
+
 import pytest
 from tiny import write_tiny_outfit
 
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.scanner import ScanConfig
+
+CHROMIUM_FLAGS = (
+    "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync "
+    "--disable-quic --no-first-run"
+)
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +24,17 @@ def tiny_folder(tmp_path_factory):
 def tiny_outfit(tiny_folder):
     """The tiny outfit, 4,000 scan points a frame: 6 train and 3 test frames of cloth that follows from the pose."""
     return OpenOutfit(tiny_folder, "open", ScanConfig(points=4000))
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A headless Chromium, the one of the system."""
+    from playwright.sync_api import sync_playwright
+
+    executable = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if executable is None:
+        pytest.fail("Chromium is needed to see reports as readers do. Run: apt-get install -y chromium")
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=executable, args=CHROMIUM_FLAGS.split())
+        yield chromium
+        chromium.close()

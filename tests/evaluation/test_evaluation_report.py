@@ -3,7 +3,6 @@
 import base64
 import io
 import re
-import shutil
 from html import unescape
 
 import numpy as np
@@ -17,10 +16,6 @@ from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent
 from avatar.evaluation.scores import Score
 from avatar.evaluation.tables import metric_table, outfit_table
 
-CHROMIUM_FLAGS = (
-    "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync "
-    "--disable-quic --no-first-run"
-)
 LOG = "split,step,epoch,seconds,total\ntrain,1,0,0.1,4\nvalidation,1,0,0.2,5\ntrain,2,0,0.3,3\n"
 HOSTILE = "<script>alert('x')</script> & \"quotes\""
 
@@ -54,19 +49,6 @@ def full_content(folder, text="the text"):
         pictures=pictures,
         files=(folder / "metrics.csv", folder / "meshes", folder / "meshes" / "a b&c.ply", folder / "gone.ply"),
     )
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    executable = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if executable is None:
-        pytest.fail("Chromium is needed to see reports as readers do. Run: apt-get install -y chromium")
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=executable, args=CHROMIUM_FLAGS.split())
-        yield chromium
-        chromium.close()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -1,0 +1,160 @@
+"""The main job from data to report, on the tiny outfit and at the smallest size that still learns."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from training.test_runs import SETTINGS
+
+from avatar.checks import AvatarError, DataError
+from avatar.evaluation.scores import read_scores
+from avatar.evaluation.scoring import ScoreConfig
+from avatar.io.meshes import read_mesh
+from avatar.io.motions import write_motion
+from avatar.io.points import read_points
+from avatar.pipeline.demo import DemoConfig, demo
+from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
+from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
+from avatar.simulate.sequences import authored_motion
+from avatar.training.loop import Schedule, TrainConfig
+from avatar.training.losses import LossConfig
+from avatar.training.runs import MethodChoice
+
+pytestmark = pytest.mark.slow
+METRICS = ["cd_point", "cd_pop", "normal_l1", "penetration_share"]
+
+
+@pytest.fixture(scope="module")
+def job(tiny_folder, tmp_path_factory) -> tuple[DemoConfig, dict]:
+    """The settings of a finished main job and its summary."""
+    train = TrainConfig(
+        steps=120,
+        points=2000,
+        scan_points=2000,
+        batch=2,
+        fresh_points=True,
+        lr=5e-3,
+        code_lr=1e-2,
+        schedule=Schedule.cosine,
+        validate_every=60,
+        loss=LossConfig(offset=20, normal_start=0.2),
+    )
+    config = DemoConfig(
+        method=MethodChoice("closet", "closet", SETTINGS),
+        dataset=tiny_folder.parent.name,
+        outfit=(tiny_folder.name,),
+        data_root=tiny_folder.parents[1],
+        runs_root=tmp_path_factory.mktemp("runs"),
+        train=train,
+        points=12_000,
+        meshes=2,
+        score=ScoreConfig(scan_points=4000, metrics=METRICS),
+        static_share=1.0,
+    )
+    return config, json.loads(demo(config).read_text())
+
+
+def test_summary_names_every_stage_and_file(job):
+    config, summary = job
+    stages = {"train", "train static floor", "predict", "evaluate", "mesh", "report", "total"}
+    assert set(summary["seconds"]) == stages
+    made = summary["made"]
+    assert all(Path(path).exists() for path in (made["report"], made["weights"], *made["points"], *made["meshes"]))
+    assert Path(made["report"]).is_relative_to(config.runs_root)
+
+
+def test_every_test_frame_is_predicted_scored_and_some_are_meshed(job, tiny_outfit):
+    config, summary = job
+    folder = config.folder / "predictions" / "test" / "tiny"
+    clouds = {path.stem: read_points(path) for path in folder.glob("*.ply")}
+    assert set(clouds) == set(tiny_outfit.frames("test"))
+    assert all(len(cloud.points) == 12_000 for cloud in clouds.values())
+    meshes = [read_mesh(path) for path in (config.folder / "meshes" / "test" / "tiny").glob("*.*")]
+    assert len(meshes) == 2 * 3
+    assert all(1.2 < np.ptp(found.vertices[:, 1]) < 2 for found in meshes)
+    rows = {(row["method"], row["metric"]): row["value"] for row in summary["metrics"]}
+    assert {method for method, _ in rows} == {"sampling", "body", "static", "closet"}
+    cd = {method: rows[method, "cd_point"] for method in ("sampling", "body", "static", "closet")}
+    assert min(cd, key=cd.get) == "sampling"
+    assert cd["closet"] < cd["body"]
+    assert len(read_scores(config.folder / "scores.csv").frames) == len(METRICS) * len(clouds)
+
+
+def test_report_opens_in_a_browser_with_its_pictures(job, browser):
+    _, summary = job
+    page, complaints, requests = browser.new_page(), [], []
+    page.on("console", lambda message: complaints.append(message.text))
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto(Path(summary["made"]["report"]).as_uri(), wait_until="load")
+    assert complaints == []
+    assert [url for url in requests if not url.startswith(("data:", "file:"))] == []
+    images = page.locator("img")
+    poses = 3  # each with ground truth, prediction, template and error; two with a mesh; one template at rest
+    assert images.count() == 4 * poses + 2 + 1
+    for index in range(images.count()):
+        spread = images.nth(index).evaluate(
+            "async image => { await image.decode(); const c = document.createElement('canvas');"
+            "c.width = image.naturalWidth; c.height = image.naturalHeight; const g = c.getContext('2d');"
+            "g.drawImage(image, 0, 0); const d = g.getImageData(0, 0, c.width, c.height).data;"
+            "return new Set(d).size; }"
+        )
+        assert spread > 20  # many grey levels: not blank
+    page.close()
+
+
+def test_going_on_with_a_finished_job_repeats_nothing(job):
+    config, summary = job
+    weights = (config.folder / "avatar.safetensors").read_bytes()
+    again = json.loads(demo(config).read_text())
+    assert (config.folder / "avatar.safetensors").read_bytes() == weights
+    assert {**again, "seconds": None} == {**summary, "seconds": None}
+
+
+def test_a_motion_becomes_points_meshes_and_animation_files(job, tmp_path):
+    config, _ = job
+    motion = tmp_path / "stroll.npz"
+    write_motion(motion, authored_motion("walk", fps=5, seconds=0.6))
+    (folder,) = predict(PredictConfig(run=config.folder, motion=motion, fps=5, points=4000))
+    frames = sorted(folder.glob("*.ply"))
+    assert len(frames) >= 3
+    mesh(MeshConfig(run=config.folder, predictions=folder.parent.name, formats=("ply",), frames=2))
+    made = export(ExportConfig(run=config.folder, predictions=folder.parent.name, fps=5, motion=motion))
+    assert {path.name for path in made} == {"points.usdc", "meshes.usdc", "preview.webp", "body.glb"}
+    assert all(path.stat().st_size > 1000 for path in made)
+
+
+def test_foreign_predictions_are_scored_from_their_folder(job, capsys):
+    config, _ = job
+    folder = config.folder / "predictions" / "test" / "tiny"
+    settings = EvaluateConfig(
+        predictions=folder,
+        method="theirs",
+        dataset=config.dataset,
+        outfit="tiny",
+        data_root=config.data_root,
+        score=config.score,
+        out=config.runs_root / "theirs",
+        floors=False,
+    )
+    scores = evaluate(settings)
+    assert {row.method for row in scores.rows} == {"theirs"}
+    assert "theirs" in capsys.readouterr().out
+    with pytest.raises(DataError, match=r"no such folder.*tools/predict\.py"):
+        evaluate(
+            EvaluateConfig(
+                predictions=folder / "none", dataset=config.dataset, outfit="tiny", data_root=config.data_root
+            )
+        )
+
+
+def test_what_was_not_made_yet_is_named(job):
+    config, _ = job
+    with pytest.raises(DataError, match=r"no predictions here.*tools/predict\.py"):
+        mesh(MeshConfig(run=config.folder, predictions="dance"))
+    with pytest.raises(DataError, match=r"no predictions here.*tools/predict\.py"):
+        export(ExportConfig(run=config.folder, predictions="dance"))
+    with pytest.raises(AvatarError, match="split: expected train or test"):
+        predict(PredictConfig(run=config.folder, split="tests"))
