@@ -143,11 +143,7 @@ def test_foreign_predictions_are_scored_from_their_folder(job, capsys):
     assert {row.method for row in scores.rows} == {"theirs"}
     assert "theirs" in capsys.readouterr().out
     with pytest.raises(DataError, match=r"no such folder.*tools/predict\.py"):
-        evaluate(
-            EvaluateConfig(
-                predictions=folder / "none", dataset=config.dataset, outfit="tiny", data_root=config.data_root
-            )
-        )
+        evaluate(replace(settings, predictions=folder / "none"))
 
 
 def test_what_was_not_made_yet_is_named(job):

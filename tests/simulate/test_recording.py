@@ -1,0 +1,169 @@
+"""Configuration, pose selection, gates and resuming, without the solver."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.body.open import open_body
+from avatar.checks import AvatarError
+from avatar.io.frames import OpenFrame, read_open_frame, write_open_frame
+from avatar.records import Motion
+from avatar.simulate import gates as gates_module
+from avatar.simulate.dressing import Rest, bind_pose, pose_path
+from avatar.simulate.gates import GateConfig, edge_stretch, frame_names, missed, record_frame
+from avatar.simulate.poses import NamedPose
+from avatar.simulate.production import is_sound
+from avatar.simulate.recording import (
+    PRESETS,
+    SimulateConfig,
+    dressed_outfits,
+    history_error,
+    load_motion,
+    settled_poses,
+    spread_poses,
+)
+
+POSE = NamedPose("walk.00003", np.full((22, 3), 0.1, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("changes", "lists"),
+    [
+        ({"preset": "fast"}, "quick, sample, full, motion"),
+        ({"outfits": ["tee", "tuxedo"]}, "tee, shirt, skirt, dress, jacket"),
+        ({"shapes": ["neutral"]}, "female"),
+        ({"train": -1}, "at least 0"),
+        ({"fps": 0.0}, "positive"),
+    ],
+)
+def test_wrong_settings_say_what_is_right(changes, lists):
+    with pytest.raises(AvatarError, match=lists):
+        SimulateConfig(**changes)
+
+
+def test_presets_are_as_promised():
+    assert len(PRESETS["quick"].outfits) == 1
+    assert (PRESETS["sample"].train, PRESETS["sample"].test) == (60, 20)
+    assert (PRESETS["full"].train, PRESETS["full"].test, len(PRESETS["full"].outfits)) == (300, 100, 5)
+    assert not set(PRESETS["motion"].train_motions) & set(PRESETS["motion"].test_motions)
+
+
+def test_folders_tell_bodies_apart():
+    both = dressed_outfits(SimulateConfig(outfits=["dress"], shapes=["female", "male"]))
+    assert [(folder, clothes.shape) for folder, clothes in both] == [("dress", "female"), ("dress_male", "male")]
+
+
+def test_settled_poses_follow_preset_and_overrides():
+    poses = settled_poses(SimulateConfig(preset="quick", train=3, test=0))
+    assert list(poses) == ["train"] and len(poses["train"]) == 3
+    given = settled_poses(SimulateConfig(train=4, test=2, train_motions=["walk"], test_motions=["kick"], seconds=1.0))
+    assert [pose.name.split(".")[0] for pose in given["train"] + given["test"]] == ["walk"] * 4 + ["kick"] * 2
+
+
+def test_spread_poses_take_first_and_last():
+    motion = Motion(np.arange(10 * 66, dtype=np.float32).reshape(10, 22, 3), np.zeros((10, 3)), 30.0, "m")
+    picked = spread_poses([motion, motion], 3)
+    assert [pose.name for pose in picked] == ["m.00000", "m.00000", "m.00009"]
+    np.testing.assert_array_equal(picked[-1].pose, motion.poses[-1])
+
+
+def test_unknown_motion_lists_the_known():
+    with pytest.raises(AvatarError, match="walk, squat"):
+        load_motion("moonwalk", 30.0, 1.0)
+
+
+@pytest.mark.parametrize("shape", ["female", "male"])
+def test_bind_pose_gives_the_bind_shape(shape):
+    body = open_body(shape)
+    posed = body(torch.from_numpy(bind_pose(body))[None]).vertices[0]
+    torch.testing.assert_close(posed, body.bind_vertices, atol=2e-5, rtol=0)
+
+
+def test_pose_path_goes_evenly_to_its_end():
+    start, end = np.zeros((22, 3), np.float32), np.zeros((22, 3), np.float32)
+    end[5] = [0, 1.2, 0]
+    path = pose_path(start, end, 9)
+    np.testing.assert_allclose(path[-1], end, atol=1e-6)
+    assert (np.diff(path[:, 5, 1]) > 0).all() and np.abs(path[:, 5, [0, 2]]).max() < 1e-6
+
+
+def fake_dressed(speeds):
+    """A dressed body whose cloth is one triangle and whose settling goes as listed."""
+    triangle = np.array([[0, 0, 1.0], [1, 0, 1], [0, 1, 1]])
+    calls = []
+
+    def settle(pose, stride=None, via=()):
+        calls.append((stride, len(via)))
+        speed = speeds[len(calls) - 1]
+        if speed is None:
+            raise AvatarError("the solver diverged")
+        return Rest(triangle + speed, speed, 1)
+
+    return SimpleNamespace(
+        faces=np.array([[0, 1, 2]]),
+        garments=[SimpleNamespace(vertices=triangle)],
+        travel=SimpleNamespace(stride=0.01),
+        outfit=SimpleNamespace(name="fake"),
+        settle=settle,
+        calls=calls,
+    )
+
+
+@pytest.fixture
+def examined(monkeypatch):
+    """Frames without a body: nothing inside it, everything seen."""
+    monkeypatch.setattr(
+        gates_module,
+        "examine",
+        lambda dressed, pose, cloth: OpenFrame(
+            pose, np.zeros(3, np.float32), cloth, np.ones(4, bool), np.ones(1, bool), 0.0, 0.0
+        ),
+    )
+
+
+def test_a_frame_that_fails_travels_more_slowly(tmp_path, examined):
+    dressed = fake_dressed([None, 0.5, 0.0])
+    report = record_frame(dressed, POSE, tmp_path / "train" / "f.npz", GateConfig())
+    assert not report.failed and report.attempts == 3
+    strides = [stride for stride, _ in dressed.calls]
+    assert strides == sorted(strides, reverse=True) and len(set(strides)) == 3
+    np.testing.assert_array_equal(read_open_frame(tmp_path / "train" / "f.npz").pose, POSE.pose)
+
+
+def test_a_frame_that_never_passes_is_not_written(tmp_path, examined):
+    report = record_frame(fake_dressed([0.5] * 3), POSE, tmp_path / "f.npz", GateConfig())
+    assert report.attempts == 3 and report.failed == ("speed 0.5 > 0.001",)
+    assert not (tmp_path / "f.npz").exists()
+
+
+def test_stretch_is_measured_in_rest_lengths():
+    dressed = fake_dressed([])
+    assert edge_stretch(dressed, dressed.garments[0].vertices * 1.25) == pytest.approx(1.25)
+    assert missed({"stretch": 1.31, "depth": 0.004}, GateConfig()) == ("stretch 1.31 > 1.3",)
+
+
+def test_history_error_compares_both_ways():
+    dressed = fake_dressed([0.0, 0.003])
+    error = history_error(dressed, [POSE, POSE])
+    assert error.mean == pytest.approx(0.003 * np.sqrt(3)) and error.poses == 1
+    assert [via for _, via in dressed.calls] == [0, 1]
+    with pytest.raises(AvatarError, match="at least 2"):
+        history_error(dressed, [POSE])
+
+
+def test_only_sound_frames_are_kept(tmp_path):
+    path = tmp_path / "f.npz"
+    assert not is_sound(path, POSE.pose, 3)
+    cloth = np.zeros((3, 3), np.float32)
+    write_open_frame(path, OpenFrame(POSE.pose, np.zeros(3), cloth, np.ones(4, bool), np.ones(1, bool)))
+    assert is_sound(path, POSE.pose, 3)
+    assert not is_sound(path, POSE.pose + 0.1, 3) and not is_sound(path, POSE.pose, 4)
+    path.write_bytes(path.read_bytes()[:-20])
+    assert not is_sound(path, POSE.pose, 3)
+
+
+def test_frame_names_count_from_zero():
+    motion = Motion(np.zeros((2, 22, 3)), np.zeros((2, 3)), 30.0, "kick")
+    assert frame_names(motion) == ["kick.00000", "kick.00001"]
