@@ -48,6 +48,7 @@ class TrainConfig:
     batch: int = 4  # frames a step
     points: int = 50000  # template points predicted for each frame
     fresh_points: bool = False  # draw new template points every step, instead of one fixed set
+    mirror: bool = False  # show half of the frames mirrored: for symmetric clothes, twice the poses
     scan_points: int = 40000  # scan points a frame, drawn anew every epoch from those there are
     lr: float = 3e-4  # networks
     code_lr: float = 5e-4  # garment codes

@@ -15,6 +15,7 @@ from avatar.body.packed import read_template, write_template
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
+from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
 from avatar.data.outfits import SAFE_NAME, Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
@@ -113,10 +114,16 @@ def train_run(config: RunConfig) -> Path:
     trainer = Trainer(model, template.vertices, template.faces, config.train, config.folder)
     checks = FrameDataset(outfits, held_back, *scans) if held_back else None
 
+    symmetry = mirror_map(template) if config.train.mirror else None
+
+    def batch_at(step: int) -> Batch:
+        batch = frames.batch_at(step, size)
+        return batch if symmetry is None else mirror_batch(batch, mirror_coins(config.train.seed, step, size), symmetry)
+
     def validation() -> Iterator[Batch]:
         return checks.ordered_batches(size) if checks else iter(())
 
-    trainer.fit(lambda step: frames.batch_at(step, size), frames.epoch_length(size), validation)
+    trainer.fit(batch_at, frames.epoch_length(size), validation)
     write_template(config.folder / "template.npz", template)
     facts = {"config": settings_to_dict(config), "steps": trainer.step, "seconds": trainer.seconds}
     write_weights(config.folder / WEIGHTS, model.state_dict(), facts)
