@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -15,16 +16,16 @@ from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import axis_angle_from_rotation, rotation_from_axis_angle, transform_points
 from avatar.simulate.garments import Garment, cut_garment
-from avatar.simulate.layering import lift_off, tuck
 from avatar.simulate.implicit import smoothing_matrix
+from avatar.simulate.layering import lift_off, tuck
 from avatar.simulate.outfits import OutfitConfig
 from avatar.simulate.solver import ClothSolver, Collider, SolverConfig
 
 CLING_GAP = (0.02, 0.045)  # m between cloth and skin over which its cling to the skin fades out
 WAISTBAND_STIFFNESS = 3.0  # N/m a vertex: an elastic waistband stays where it is put
 COVERED_GAP = 0.05  # m: skin nearer than this to a garment is under it
-LEAST_GAP = 0.0015  # m kept between tucked cloth and skin
-LAYER_GAP = 0.012  # m: what a garment's thickness and small folds add to the body under the next one
+LEAST_GAP = 0.001  # m kept between all cloth and skin at the end
+PLAY_STEPS = 4  # fewest steps from one frame of a continuous motion to the next
 
 
 @dataclass
@@ -94,8 +95,7 @@ class DressedBody:
         self.layers = self.make_layers()
         self.solvers = None
         self.start = np.concatenate([g.vertices for g in self.garments])
-        still = np.repeat(self.start_pose[None], 1, axis=0)
-        self.start = self.run(still, self.travel.hold).cloth
+        self.start = self.run(self.start_pose[None], self.travel.hold).cloth
 
     def make_layers(self) -> list[Layer]:
         """Anchors and colliders of all garments, the innermost first."""
@@ -105,7 +105,7 @@ class DressedBody:
         layers = []
         for garment, start in zip(self.garments, self.offsets):
             gap, ids = cKDTree(vertices).query(garment.vertices)
-            average, rim = smoothing_matrix(garment.faces, len(garment.vertices))
+            average, _ = smoothing_matrix(garment.faces, len(garment.vertices))
             weights = self.body.weights.numpy()[ids].astype(np.float64)
             for _ in range(5):
                 weights = 0.5 * weights + 0.5 * (average @ weights)
@@ -117,7 +117,7 @@ class DressedBody:
             part = slice(int(start), int(start) + len(garment.vertices))
             room = torch.from_numpy(lift.copy()).float()
             layers.append(Layer(garment, torch.from_numpy(weights).float(), stiffness, room, part))
-            lift = lift + LAYER_GAP * covered_skin(vertices, garment)
+            lift = lift + garment.config.room * covered_skin(vertices, garment)
             for _ in range(10):
                 lift = spread @ lift
         return layers
@@ -159,14 +159,14 @@ class DressedBody:
         check_shape("pose", pose, "J 3", J=len(self.body.parents))
         check_finite("pose", pose)
         stops = [self.start_pose, *via, pose]
-        legs = [self.leg(a, b, stride or self.travel.stride) for a, b in zip(stops, stops[1:])]
+        legs = [self.leg(a, b, stride or self.travel.stride) for a, b in itertools.pairwise(stops)]
         return self.run(np.concatenate(legs), self.travel.hold)
 
-    def leg(self, start: np.ndarray, end: np.ndarray, stride: float) -> np.ndarray:
+    def leg(self, start: np.ndarray, end: np.ndarray, stride: float, least: int = 2) -> np.ndarray:
         """Poses from one stop to the next, as many as the farthest-moving vertex needs."""
         sketch = self.posed_body(np.concatenate([start[None], pose_path(start, end, 8)]))
         way = np.linalg.norm(np.diff(sketch, axis=0), axis=-1).max(1).sum()
-        return pose_path(start, end, max(2, int(np.ceil(1.5 * way / stride))))
+        return pose_path(start, end, max(least, int(np.ceil(1.5 * way / stride))))
 
     def run(self, poses: np.ndarray, hold: int) -> Rest:
         """Leads the outfit along poses, then holds the last one until the cloth rests, layer by layer."""
@@ -185,15 +185,29 @@ class DressedBody:
             raise AvatarError(f"outfit {self.outfit.name!r}: the solver diverged; use a smaller stride.")
         return Rest(self.in_order(cloth, posed.vertices[-1].numpy()), speed, steps)
 
+    def play(self, poses: np.ndarray) -> np.ndarray:
+        """Cloth ``(T, V, 3)`` over a continuous motion ``(T, J, 3)``: settled in its first pose, then following."""
+        check_shape("poses", poses, "T J 3", J=len(self.body.parents))
+        check_finite("poses", poses)
+        self.settle(poses[0])
+        legs = [poses[:1]] + [self.leg(a, b, self.travel.stride, PLAY_STEPS) for a, b in itertools.pairwise(poses)]
+        cloth = np.zeros((len(poses), len(self.start), 3), np.float32)
+        for layer, solver in zip(self.layers, self.solvers):
+            for frame, leg in enumerate(legs):
+                posed = self.body(torch.as_tensor(leg, dtype=torch.float32))
+                motions = posed.joint_transforms @ self.body.zero_from_bind
+                self.follow(layer, solver, self.under(layer, posed.vertices), motions, 0)
+                cloth[frame, layer.part] = solver.positions
+        return np.stack([self.in_order(c, b) for c, b in zip(cloth, self.posed_body(poses))])
+
     def in_order(self, cloth: np.ndarray, body_points: np.ndarray) -> np.ndarray:
         """The outfit's cloth with inner garments under outer ones, outside the body."""
         faces = self.body.faces.numpy()
         for above in range(len(self.layers) - 1, 0, -1):
             outer = self.layers[above]
             for inner in self.layers[:above]:
-                tucked = tuck(cloth[inner.part], cloth[outer.part], outer.garment.faces)
-                cloth[inner.part] = lift_off(tucked, body_points, faces, LEAST_GAP)
-        return cloth
+                cloth[inner.part] = tuck(cloth[inner.part], cloth[outer.part], outer.garment.faces)
+        return lift_off(cloth, body_points, faces, LEAST_GAP)
 
     def follow(self, layer: Layer, solver: ClothSolver, under: np.ndarray, motions: torch.Tensor, hold: int) -> int:
         """Leads one layer through ``(T, V, 3)`` colliders and holds it at the last until it rests; counts steps."""

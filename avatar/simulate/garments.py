@@ -22,8 +22,8 @@ from avatar.simulate.implicit import (
     relax,
     surface_nets,
 )
-from avatar.simulate.outfits import GarmentConfig
 from avatar.simulate.layering import lift_off
+from avatar.simulate.outfits import GarmentConfig
 from avatar.simulate.visibility import body_distances
 
 PAD = 0.12  # metres of free grid around the body
@@ -173,8 +173,8 @@ def cuts(cutting: Cutting, config: GarmentConfig) -> list:
         along = (chain[start + 1] - chain[start]) / np.linalg.norm(chain[start + 1] - chain[start])
         end = chain[start] + (config.sleeve - start) * (chain[start + 1] - chain[start])
 
-        def sleeve(v, arm, end=end, along=along, sign=np.sign(chain[0, 0])):
-            return np.where((arm > 0.5) & (v[:, 0] * sign > 0), (v - end) @ along, -1.0)
+        def sleeve(v, arm, end=end, along=along, outward=chain[0, 0]):
+            return np.where((arm > 0.5) & (v[:, 0] * outward > 0), (v - end) @ along, -1.0)
 
         made.append(sleeve)
     if config.opening:
@@ -188,8 +188,9 @@ def neckline(cutting: Cutting, config: GarmentConfig):
     """The cut of a round neck: an upright elliptic cylinder around the neck, a little deeper in front."""
     neck, head = cutting.joints["neck"], cutting.joints["head"]
     (half, back, _), (_, _, front) = cutting.profile(np.array([(neck[1] + head[1]) / 2, neck[1] - 0.085]))
-    back -= 0.012
-    radii = np.array([half + 0.018, (front - back) / 2]) + config.neck
+    back -= max(0.012, config.ease - 0.002)
+    half += max(0.018, config.ease + 0.004)
+    radii = np.array([half, (front - back) / 2]) + config.neck
     centre = (front + back) / 2
 
     def cut(v, arm):

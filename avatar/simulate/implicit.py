@@ -83,8 +83,9 @@ def split_quads(vertices: np.ndarray, quads: np.ndarray) -> np.ndarray:
 
 def mesh_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Undirected edges ``(E, 2)`` and how many faces have each ``(E,)``."""
-    return np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0,
-                     return_counts=True)
+    return np.unique(
+        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0, return_counts=True
+    )
 
 
 def clip(vertices: np.ndarray, faces: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

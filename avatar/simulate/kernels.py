@@ -7,9 +7,7 @@ import warp as wp
 
 
 @wp.kernel
-def signed_distances(
-    mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: float, distances: wp.array(dtype=float)
-):
+def signed_distances(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: float, distances: wp.array(dtype=float)):
     """Distance of each point to a closed mesh, negative inside; ``reach`` where nothing is nearer."""
     i = wp.tid()
     query = wp.mesh_query_point_sign_normal(mesh, points[i], reach)
@@ -107,9 +105,7 @@ def apply_hessian(
 
 
 @wp.kernel
-def extrapolate(
-    positions: wp.array(dtype=wp.vec3), last: wp.array(dtype=wp.vec3), momentum: float, longest: float
-):
+def extrapolate(positions: wp.array(dtype=wp.vec3), last: wp.array(dtype=wp.vec3), momentum: float, longest: float):
     """Carries each particle on by a share of its last step, at most ``longest`` metres; remembers where it was."""
     i = wp.tid()
     x = positions[i]

@@ -46,7 +46,5 @@ def tuck(inner: np.ndarray, outer: np.ndarray, outer_faces: np.ndarray) -> np.nd
     normals = warp.array(normals, dtype=warp.vec3, device="cpu")
     points = warp.array(np.ascontiguousarray(inner, np.float32), dtype=warp.vec3, device="cpu")
     for _ in range(TUCK_ROUNDS):
-        warp.launch(
-            kernels.tuck_under, len(inner), [mesh.id, normals, TUCK_GAP, TUCK_REACH, points], device="cpu"
-        )
+        warp.launch(kernels.tuck_under, len(inner), [mesh.id, normals, TUCK_GAP, TUCK_REACH, points], device="cpu")
     return points.numpy().copy()

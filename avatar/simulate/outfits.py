@@ -44,6 +44,7 @@ class GarmentConfig:
     neck: float = 0.0  # m by which the neckline is lowered
     edge: float = 0.018  # m, target edge length
     waistband: float = 0.0  # m of elastic band under the upper edge
+    room: float = 0.012  # m that it and its small folds add to the body under the next garment
     cling: float = 0.02  # N/m a vertex: elastic pull to its place on the skin where the cloth is tight
     fabric: FabricConfig = field(default_factory=FabricConfig)
 
@@ -93,11 +94,13 @@ GARMENTS = {
         tee(bottom=2.4),
     ],
     "dress": lambda: [
-        GarmentConfig("dress", bottom=0.35, sleeve=0.55, ease=0.012, sleeve_ease=0.015, drop=2.7, flare=0.2, edge=0.0225)
+        GarmentConfig(
+            "dress", bottom=0.35, sleeve=0.55, ease=0.012, sleeve_ease=0.015, drop=2.7, flare=0.2, edge=0.0225
+        )
     ],
     "jacket": lambda: [
-        trousers(edge=0.026),
-        tee(bottom=2.4, sleeve=0.4, ease=0.01, sleeve_ease=0.01, edge=0.022),
+        trousers(edge=0.024),
+        tee(bottom=2.4, sleeve=0.4, room=0.022, ease=0.01, sleeve_ease=0.01, edge=0.022),
         GarmentConfig(
             "jacket",
             bottom=2.0,
@@ -115,14 +118,15 @@ GARMENTS = {
     ],
 }
 OUTFIT_NAMES = tuple(GARMENTS)
+DEFAULT_SHAPES = {"tee": "male", "shirt": "male", "skirt": "female", "dress": "female", "jacket": "female"}
 
 
-def outfit(name: str, shape: str = "female") -> OutfitConfig:
-    """A named outfit on a body shape.
+def outfit(name: str, shape: str | None = None) -> OutfitConfig:
+    """A named outfit on a body shape, its usual one if None.
 
     Raises:
         AvatarError: for an unknown name, listing those there are.
     """
     if name not in GARMENTS:
         raise AvatarError(f"outfit: expected one of {', '.join(GARMENTS)}, got {name!r}.")
-    return OutfitConfig(name, shape, GARMENTS[name]())
+    return OutfitConfig(name, shape or DEFAULT_SHAPES[name], GARMENTS[name]())

@@ -1,207 +1,163 @@
-"""Recording: settled frames checked by gates and written one by one, over processes, so that runs resume."""
+"""Recording the open dataset: presets, poses from draws, sequences or motion files, and the history error."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
-from multiprocessing import get_context
+import logging
+import os
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import torch
-import yaml
-from tqdm import tqdm
 
-from avatar import __version__
-from avatar.body.open import open_body
-from avatar.checks import AvatarError, DataError
-from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, write_manifest, write_open_frame, write_open_garment
-from avatar.simulate.dressing import DressedBody, TravelConfig
-from avatar.simulate.implicit import mesh_edges
-from avatar.simulate.outfits import OutfitConfig
-from avatar.simulate.poses import NamedPose
-from avatar.simulate.visibility import measure_penetration, visible_faces
+from avatar.body.open import open_body_shapes
+from avatar.checks import AvatarError
+from avatar.io.motions import read_motion, resample_motion
+from avatar.records import Motion
+from avatar.simulate.dressing import TravelConfig
+from avatar.simulate.gates import FrameReport, GateConfig
+from avatar.simulate.memory import history_error, pose_sensitivity
+from avatar.simulate.outfits import DEFAULT_SHAPES, OUTFIT_NAMES, OutfitConfig, outfit
+from avatar.simulate.poses import NamedPose, draw_poses
+from avatar.simulate.production import dress, simulate_motions, simulate_outfit
+from avatar.simulate.sequences import SEQUENCES, authored_motion
 
-STRIDES = (1.0, 0.6, 0.35)  # shares of the configured stride, tried in turn until a frame passes the gates
-
-
-@dataclass
-class GateConfig:
-    """What a frame must meet to be written."""
-
-    share: float = 0.005  # largest share of cloth vertices inside the body
-    depth: float = 0.005  # m, deepest of them
-    stretch: float = 1.3  # 99th percentile of edge lengths, in rest lengths
-    speed: float = 1e-3  # m a step, 99th percentile of vertex ways when the frame is taken
-
-    def __post_init__(self):
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise AvatarError(f"{name}: expected a positive number, got {value}.")
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class FrameReport:
-    """How one frame went: its file ``name``, the gates it ``failed`` (empty when written) and its numbers."""
+class Preset:
+    """How much is simulated: ``outfits``, settled frames a split, or continuous sequences a split instead."""
 
-    name: str
-    failed: tuple[str, ...]
-    share: float = 0.0
-    depth: float = 0.0
-    stretch: float = 1.0
-    speed: float = 0.0
-    attempts: int = 0
+    outfits: tuple[str, ...]
+    train: int = 0
+    test: int = 0
+    train_motions: tuple[str, ...] = ()
+    test_motions: tuple[str, ...] = ()
 
 
-def edge_stretch(dressed: DressedBody, cloth: np.ndarray) -> float:
-    """The 99th percentile of edge lengths in units of their rest lengths."""
-    edges, _ = mesh_edges(dressed.faces)
-    rest = np.concatenate([garment.vertices for garment in dressed.garments])
-    lengths = [np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) for points in (cloth, rest)]
-    return float(np.percentile(lengths[0] / lengths[1], 99))
+PRESETS = {
+    "quick": Preset(("tee",), 32, 12),
+    "sample": Preset(("tee", "dress"), 60, 20),
+    "full": Preset(OUTFIT_NAMES, 300, 100),
+    "motion": Preset(
+        ("tee", "dress"), train_motions=("squat", "twist", "bend", "dance"), test_motions=("walk", "reach", "kick")
+    ),
+}
 
 
-def examine(dressed: DressedBody, pose: np.ndarray, cloth: np.ndarray) -> OpenFrame:
-    """A frame with its measured penetration and visibility, from a pose and the cloth resting in it."""
-    body = dressed.posed_body(pose[None])[0]
-    body_faces = dressed.body.faces.numpy()
-    inside = measure_penetration(body, body_faces, cloth)
-    seen = visible_faces(np.concatenate([body, cloth]), np.concatenate([body_faces, dressed.faces + len(body)]))
-    return OpenFrame(
-        pose=np.asarray(pose, np.float32),
-        translation=np.zeros(3, np.float32),
-        cloth=cloth.astype(np.float32),
-        visible_body=seen[: len(body_faces)],
-        visible_cloth=seen[len(body_faces) :],
-        penetration_share=inside.share,
-        penetration_depth=inside.deepest,
-    )
+@dataclass
+class SimulateConfig:
+    """What to simulate. Anything left at None or empty is as the preset has it."""
+
+    preset: str = "quick"  # quick, sample, full, motion
+    root: str = "data/open"  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>
+    outfits: list[str] = field(default_factory=list)
+    shapes: list[str] = field(default_factory=list)  # body shapes each outfit is put on; empty is its usual one
+    train: int | None = None  # settled frames of random poses
+    test: int | None = None  # settled frames of authored sequences
+    train_motions: list[str] = field(default_factory=list)  # names of authored sequences, AMASS npz or BVH files
+    test_motions: list[str] = field(default_factory=list)
+    settled: bool = False  # record motion files as settled poses, spread over them, not as continuous sequences
+    fps: float = 30.0  # frames per second of continuous sequences
+    seconds: float = 6.0  # longest part taken of a sequence
+    seed: int = 0
+    workers: int = 0  # processes; 0 is one a core
+    history: int = 0  # poses on which history error and pose sensitivity are measured instead of recording
+    progress: bool = True
+    travel: TravelConfig = field(default_factory=TravelConfig)
+    gates: GateConfig = field(default_factory=GateConfig)
+
+    def __post_init__(self):
+        check_names("preset", [self.preset], tuple(PRESETS))
+        check_names("outfits", self.outfits, OUTFIT_NAMES)
+        check_names("shapes", self.shapes, open_body_shapes())
+        for name in ("train", "test", "workers", "history"):
+            if (getattr(self, name) or 0) < 0:
+                raise AvatarError(f"{name}: expected a number of at least 0, got {getattr(self, name)}.")
+        for name in ("fps", "seconds"):
+            if not getattr(self, name) > 0:
+                raise AvatarError(f"{name}: expected a positive number, got {getattr(self, name)}.")
 
 
-def record_frame(dressed: DressedBody, pose: NamedPose, path: Path, gates: GateConfig) -> FrameReport:
-    """Settles one pose and writes its frame if it passes the gates, travelling more slowly if it does not.
-
-    A frame that fails at every stride is not written; the report says why.
-    """
-    for attempt, share in enumerate(STRIDES, 1):
-        try:
-            rest = dressed.settle(pose.pose, stride=share * dressed.travel.stride)
-        except AvatarError as error:
-            report = FrameReport(pose.name, (str(error),), attempts=attempt)
-            continue
-        frame = examine(dressed, pose.pose, rest.cloth)
-        measured = {
-            "share": frame.penetration_share,
-            "depth": frame.penetration_depth,
-            "stretch": edge_stretch(dressed, rest.cloth),
-            "speed": rest.speed,
-        }
-        failed = tuple(f"{k} {v:.4g} > {getattr(gates, k):.4g}" for k, v in measured.items() if v > getattr(gates, k))
-        report = FrameReport(pose.name, failed, **measured, attempts=attempt)
-        if not failed:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_open_frame(path, frame)
-            return report
-    return report
+def check_names(name: str, given: list[str], known: tuple[str, ...]) -> None:
+    """Refuses names that are not known, listing those that are."""
+    unknown = [value for value in given if value not in known]
+    if unknown:
+        raise AvatarError(f"{name}: expected {', '.join(known)}, got {', '.join(map(repr, unknown))}.")
 
 
-def is_sound(path: Path, pose: np.ndarray, vertex_count: int) -> bool:
-    """Whether a frame is there, readable, of this pose and this outfit."""
-    try:
-        frame = read_open_frame(path)
-    except DataError:
-        return False
-    return len(frame.cloth) == vertex_count and np.array_equal(frame.pose, np.asarray(pose, np.float32))
+def dressed_outfits(config: SimulateConfig) -> list[tuple[str, OutfitConfig]]:
+    """Folder names and outfits on bodies that a configuration asks for."""
+    asked = []
+    for name in config.outfits or PRESETS[config.preset].outfits:
+        usual = DEFAULT_SHAPES[name]
+        for shape in config.shapes or [usual]:
+            asked.append((name if shape == usual else f"{name}_{shape}", outfit(name, shape)))
+    return asked
 
 
-def dress(outfit: OutfitConfig, travel: TravelConfig) -> DressedBody:
-    """An open body in an outfit."""
-    return DressedBody(open_body(outfit.shape), outfit, travel)
+def load_motion(source: str, fps: float, seconds: float) -> Motion:
+    """An authored sequence by name, or a motion file, with its translation dropped (the pelvis stays in place)."""
+    if source in SEQUENCES:
+        return authored_motion(source, fps, seconds)
+    if Path(source).suffix not in (".npz", ".bvh"):
+        raise AvatarError(f"motion: expected {', '.join(SEQUENCES)} or a .npz or .bvh file, got {source!r}.")
+    motion = resample_motion(read_motion(Path(source)), fps)
+    count = round(fps * seconds)
+    return Motion(motion.poses[:count], np.zeros_like(motion.translations[:count]), fps, motion.name)
 
 
-def write_outfit(dressed: DressedBody, folder: Path, gates: GateConfig) -> None:
-    """Writes what all frames share: ``garment.npz`` with the cloth settled in the T-pose, and ``outfit.yaml``."""
-    outfit = dressed.outfit
-    canonical = dressed.settle(np.zeros_like(dressed.start_pose)).cloth
-    folder.mkdir(parents=True, exist_ok=True)
-    names = tuple(garment.name for garment in outfit.garments)
-    write_open_garment(folder / "garment.npz", OpenGarment(dressed.faces, canonical, dressed.labels, names))
-    text = {
-        "name": outfit.name,
-        "body": {"model": "open", "shape": outfit.shape, "canonical": "t"},
-        "units": "metres",
-        "up": "y",
-        "licence": "CC0-1.0",
-        "garments": [asdict(garment) for garment in outfit.garments],
-        "travel": asdict(dressed.travel),
-        "gates": asdict(gates),
-        "versions": {"avatar": __version__} | {name: version(name) for name in ("newton", "warp-lang", "numpy")},
-    }
-    (folder / "outfit.yaml").write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
+def spread_poses(motions: list[Motion], count: int) -> list[NamedPose]:
+    """Poses at even distances over motions, ``count`` in all."""
+    frames = [(motion, frame) for motion in motions for frame in range(len(motion.poses))]
+    chosen = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
+    picked = [frames[i] for i in chosen]
+    return [NamedPose(f"{motion.name}.{frame:05d}", motion.poses[frame]) for motion, frame in picked]
 
 
-_worker: dict[str, object] = {}  # what a worker process keeps between frames
+def settled_poses(config: SimulateConfig) -> dict[str, list[NamedPose]]:
+    """The poses of both splits: random draws and authored sequences, or frames of the given motion files."""
+    preset, poses = PRESETS[config.preset], {}
+    for split in ("train", "test"):
+        count = getattr(config, split)
+        count = getattr(preset, split) if count is None else count
+        motions = [load_motion(source, config.fps, config.seconds) for source in getattr(config, f"{split}_motions")]
+        if count:
+            poses[split] = spread_poses(motions, count) if motions else draw_poses(count, config.seed, split)
+    return poses
 
 
-def _start_worker(outfit: OutfitConfig, travel: TravelConfig, gates: GateConfig) -> None:
-    """Dresses the body once in a worker process, on one thread."""
-    torch.set_num_threads(1)
-    _worker["dressed"], _worker["gates"] = dress(outfit, travel), gates
-
-
-def _record_in_worker(pose: NamedPose, path: Path) -> FrameReport:
-    """One frame in a worker process."""
-    return record_frame(_worker["dressed"], pose, path, _worker["gates"])
-
-
-def simulate_outfit(
-    outfit: OutfitConfig,
-    root: Path,
-    poses: dict[str, Sequence[NamedPose]],
-    workers: int = 1,
-    travel: TravelConfig | None = None,
-    gates: GateConfig | None = None,
-    progress: bool = True,
-) -> list[FrameReport]:
-    """Simulates and writes an outfit's frames; those already there and sound are kept, so that a run resumes.
-
-    Args:
-        outfit: what is worn, by which body.
-        root: dataset folder; frames go to ``<root>/<outfit>/<split>/<sequence>.<frame>.npz``.
-        poses: poses of each split.
-        workers: processes; 1 works in this one.
-        travel, gates: settings; defaults if None.
-        progress: whether to show a progress bar.
+def simulate(config: SimulateConfig) -> list[FrameReport]:
+    """Makes an open dataset, or measures its history error, as configured.
 
     Returns:
-        A report of every frame made in this run; those with ``failed`` were not written.
+        Reports of the frames made in this run; those refused by the gates say why and are logged as warnings.
     """
-    travel, gates = travel or TravelConfig(), gates or GateConfig()
-    folder = Path(root) / outfit.name
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    dressed = dress(outfit, travel)
-    if not (folder / "garment.npz").is_file() or not (folder / "outfit.yaml").is_file():
-        write_outfit(dressed, folder, gates)
-    count = len(dressed.faces), len(dressed.labels)
-    jobs = [(pose, folder / split / f"{pose.name}.npz") for split, named in poses.items() for pose in named]
-    jobs = [(pose, path) for pose, path in jobs if not is_sound(path, pose.pose, count[1])]
-    bar = tqdm(total=len(jobs), desc=f"{outfit.name} on {outfit.shape}", unit="frame", disable=not progress)
-    reports = []
-    if workers == 1 or len(jobs) < 2:
-        for pose, path in jobs:
-            reports.append(record_frame(dressed, pose, path, gates))
-            bar.update()
+    workers = config.workers or len(os.sched_getaffinity(0))
+    preset, root = PRESETS[config.preset], Path(config.root)
+    sources = {
+        split: getattr(config, f"{split}_motions") or list(getattr(preset, f"{split}_motions"))
+        for split in ("train", "test")
+    }
+    continuous = any(sources.values()) and not config.settled
+    if continuous:
+        motions = {k: [load_motion(s, config.fps, config.seconds) for s in v] for k, v in sources.items()}
     else:
-        with ProcessPoolExecutor(
-            workers, get_context("spawn"), _start_worker, (outfit, travel, gates)
-        ) as pool:
-            for future in as_completed([pool.submit(_record_in_worker, *job) for job in jobs]):
-                reports.append(future.result())
-                bar.update()
-    bar.close()
-    torch.set_num_threads(threads)
-    write_manifest(folder)
+        poses = settled_poses(config)
+    reports: list[FrameReport] = []
+    for folder, clothes in dressed_outfits(config):
+        if config.history:
+            dressed = dress(clothes, config.travel)
+            measured = draw_poses(config.history + 1, config.seed, "test")
+            log.info("%s: %s", folder, history_error(dressed, measured))
+            log.info("%s: %s", folder, pose_sensitivity(dressed, measured[:-1], seed=config.seed))
+        elif continuous:
+            reports += simulate_motions(clothes, root / folder, motions, workers, config.travel, config.gates)
+        else:
+            reports += simulate_outfit(
+                clothes, root / folder, poses, workers, config.travel, config.gates, config.progress
+            )
+    for report in reports:
+        if report.failed:
+            log.warning("%s: refused after %d attempts: %s", report.name, report.attempts, "; ".join(report.failed))
     return reports

@@ -70,8 +70,14 @@ class Contacts:
     thickness, creeping friction, anchors, and a limit on each step that keeps vertices outside.
     """
 
-    def __init__(self, collider: Collider, thickness: np.ndarray, friction: np.ndarray, anchor_stiffness: np.ndarray,
-                 config: SolverConfig):
+    def __init__(
+        self,
+        collider: Collider,
+        thickness: np.ndarray,
+        friction: np.ndarray,
+        anchor_stiffness: np.ndarray,
+        config: SolverConfig,
+    ):
         from avatar.simulate import kernels
 
         self.kernels, self.warp, self.config, self.collider = kernels, require("warp"), config, collider
@@ -98,9 +104,20 @@ class Contacts:
         """Adds forces and per-particle Hessians at the current iterate (called by Style3D)."""
         self.positions = state.particle_q
         self.launch(
-            self.kernels.push_apart, self.positions, previous, self.points, self.normals, self.drifts, self.anchors,
-            self.anchor_stiffness, self.thickness, self.friction, self.config.contact_stiffness, self.config.creep,
-            forces, self.hessians,
+            self.kernels.push_apart,
+            self.positions,
+            previous,
+            self.points,
+            self.normals,
+            self.drifts,
+            self.anchors,
+            self.anchor_stiffness,
+            self.thickness,
+            self.friction,
+            self.config.contact_stiffness,
+            self.config.creep,
+            forces,
+            self.hessians,
         )
 
     def contact_hessian_diagonal(self):
@@ -124,8 +141,15 @@ class Contacts:
 class ClothSolver:
     """One garment over one collider; a step moves the collider and lets the cloth follow."""
 
-    def __init__(self, rest: np.ndarray, faces: np.ndarray, fabric: FabricConfig, collider: Collider,
-                 anchor_stiffness: np.ndarray, config: SolverConfig | None = None):
+    def __init__(
+        self,
+        rest: np.ndarray,
+        faces: np.ndarray,
+        fabric: FabricConfig,
+        collider: Collider,
+        anchor_stiffness: np.ndarray,
+        config: SolverConfig | None = None,
+    ):
         """Builds the solver.
 
         Args:

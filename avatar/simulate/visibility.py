@@ -56,8 +56,9 @@ def measure_penetration(vertices: np.ndarray, faces: np.ndarray, cloth: np.ndarr
     """How many cloth vertices lie inside the body, and how deep."""
     depths = np.maximum(-body_distances(vertices, faces, cloth, 0.1), 0)
     inside = depths > 0
-    return Penetration(float(inside.mean()), float(depths[inside].mean()) if inside.any() else 0.0,
-                       float(depths.max(initial=0)))
+    return Penetration(
+        float(inside.mean()), float(depths[inside].mean()) if inside.any() else 0.0, float(depths.max(initial=0))
+    )
 
 
 def view_directions(count: int = VIEW_COUNT) -> np.ndarray:

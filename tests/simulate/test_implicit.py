@@ -63,7 +63,7 @@ def test_clip_cuts_along_the_level_without_slivers(sphere_grid):
     area = trimesh.Trimesh(cut, kept, process=False).area
     assert area == pytest.approx(4 * np.pi * RADIUS**2 - cap, rel=0.02)
     lengths = np.linalg.norm(cut[edges[:, 0]] - cut[edges[:, 1]], axis=1)
-    assert lengths.min() > 0.15 * sphere_grid.step
+    assert lengths.min() > 0.1 * sphere_grid.step
 
 
 def test_clip_of_nothing_keeps_all_and_of_all_keeps_nothing(sphere_grid):

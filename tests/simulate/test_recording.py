@@ -13,13 +13,13 @@ from avatar.records import Motion
 from avatar.simulate import gates as gates_module
 from avatar.simulate.dressing import Rest, bind_pose, pose_path
 from avatar.simulate.gates import GateConfig, edge_stretch, frame_names, missed, record_frame
+from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.poses import NamedPose
 from avatar.simulate.production import is_sound
 from avatar.simulate.recording import (
     PRESETS,
     SimulateConfig,
     dressed_outfits,
-    history_error,
     load_motion,
     settled_poses,
     spread_poses,
@@ -151,6 +151,16 @@ def test_history_error_compares_both_ways():
     assert [via for _, via in dressed.calls] == [0, 1]
     with pytest.raises(AvatarError, match="at least 2"):
         history_error(dressed, [POSE])
+
+
+def test_pose_sensitivity_compares_cloth_with_body():
+    dressed = fake_dressed([0.0, 0.004])
+    dressed.posed_body = lambda poses: poses
+    found = pose_sensitivity(dressed, [POSE], angle=0.01)
+    assert found.cloth == pytest.approx(0.004 * np.sqrt(3))
+    assert 0.005 < found.body < 0.03
+    with pytest.raises(AvatarError, match="at least 1"):
+        pose_sensitivity(dressed, [])
 
 
 def test_only_sound_frames_are_kept(tmp_path):

@@ -1,0 +1,180 @@
+"""Producing an outfit: its frames, one independent run each, over processes, resumable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from tqdm import tqdm
+
+from avatar import __version__
+from avatar.body.open import open_body
+from avatar.checks import DataError
+from avatar.io.frames import OpenGarment, read_open_frame, read_open_garment, write_manifest, write_open_garment
+from avatar.records import Motion
+from avatar.simulate.dressing import DressedBody, TravelConfig
+from avatar.simulate.gates import FrameReport, GateConfig, frame_names, record_frame, record_motion
+from avatar.simulate.outfits import OutfitConfig
+from avatar.simulate.poses import NamedPose
+
+
+def is_sound(path: Path, pose: np.ndarray, vertex_count: int) -> bool:
+    """Whether a frame is there, readable, of this pose and this outfit."""
+    try:
+        frame = read_open_frame(path)
+    except DataError:
+        return False
+    return len(frame.cloth) == vertex_count and np.array_equal(frame.pose, np.asarray(pose, np.float32))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch on one thread: a process a core is faster, and its sums are the same on every machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def dress(outfit: OutfitConfig, travel: TravelConfig) -> DressedBody:
+    """An open body in an outfit."""
+    return DressedBody(open_body(outfit.shape), outfit, travel)
+
+
+def write_outfit(dressed: DressedBody, folder: Path, gates: GateConfig) -> None:
+    """Writes what all frames share: ``garment.npz`` with the cloth settled in the T-pose, and ``outfit.yaml``.
+
+    Raises:
+        DataError: when the folder holds frames of a garment other than the one that would be written.
+    """
+    outfit = dressed.outfit
+    if (folder / "garment.npz").is_file():
+        there = read_open_garment(folder / "garment.npz")
+        if not np.array_equal(there.faces, dressed.faces):
+            mend = "Choose another root or remove it."
+            raise DataError(folder, "it holds frames of the same outfit cut otherwise.", mend)
+        if (folder / "outfit.yaml").is_file():
+            return
+    canonical = dressed.settle(np.zeros_like(dressed.start_pose)).cloth
+    folder.mkdir(parents=True, exist_ok=True)
+    names = tuple(garment.name for garment in outfit.garments)
+    write_open_garment(folder / "garment.npz", OpenGarment(dressed.faces, canonical, dressed.labels, names))
+    text = {
+        "name": outfit.name,
+        "body": {"model": "open", "shape": outfit.shape, "canonical": "t"},
+        "units": "metres",
+        "up": "y",
+        "licence": "CC0-1.0",
+        "garments": [asdict(garment) for garment in outfit.garments],
+        "travel": asdict(dressed.travel),
+        "gates": asdict(gates),
+        "versions": {"avatar": __version__} | {name: version(name) for name in ("newton", "warp-lang", "numpy")},
+    }
+    (folder / "outfit.yaml").write_text(yaml.safe_dump(text, sort_keys=False), encoding="utf-8")
+
+
+_worker: dict[str, object] = {}  # what a worker process keeps between frames
+
+
+def _start_worker(outfit: OutfitConfig, travel: TravelConfig, gates: GateConfig) -> None:
+    """Dresses the body once in a worker process, on one thread."""
+    torch.set_num_threads(1)
+    _worker["dressed"], _worker["gates"] = dress(outfit, travel), gates
+
+
+def _play_in_worker(motion: Motion, folder: Path) -> list[FrameReport]:
+    """One sequence in a worker process."""
+    return record_motion(_worker["dressed"], motion, folder, _worker["gates"])
+
+
+def _record_in_worker(pose: NamedPose, path: Path) -> FrameReport:
+    """One frame in a worker process."""
+    return record_frame(_worker["dressed"], pose, path, _worker["gates"])
+
+
+def simulate_outfit(
+    outfit: OutfitConfig,
+    folder: Path,
+    poses: dict[str, Sequence[NamedPose]],
+    workers: int = 1,
+    travel: TravelConfig | None = None,
+    gates: GateConfig | None = None,
+    progress: bool = True,
+) -> list[FrameReport]:
+    """Simulates and writes an outfit's settled frames; those there and sound are kept, so that a run resumes.
+
+    Args:
+        outfit: what is worn, by which body.
+        folder: the outfit's folder; frames go to ``<folder>/<split>/<sequence>.<frame>.npz``.
+        poses: poses of each split.
+        workers: processes; 1 works in this one.
+        travel, gates: settings; defaults if None.
+        progress: whether to show a progress bar.
+
+    Returns:
+        A report of every frame made in this run; those with ``failed`` were not written.
+    """
+    travel, gates = travel or TravelConfig(), gates or GateConfig()
+    with one_thread():
+        dressed = dress(outfit, travel)
+        write_outfit(dressed, folder, gates)
+        jobs = [(pose, folder / split / f"{pose.name}.npz") for split, named in poses.items() for pose in named]
+        jobs = [(pose, path) for pose, path in jobs if not is_sound(path, pose.pose, len(dressed.labels))]
+        bar = {"total": len(jobs), "desc": f"{outfit.name} on {outfit.shape}", "unit": "frame", "disable": not progress}
+        if workers == 1 or len(jobs) < 2:
+            reports = [record_frame(dressed, *job, gates) for job in tqdm(jobs, **bar)]
+        else:
+            with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (outfit, travel, gates)) as pool:
+                futures = [pool.submit(_record_in_worker, *job) for job in jobs]
+                reports = [future.result() for future in tqdm(as_completed(futures), **bar)]
+    write_manifest(folder)
+    return reports
+
+
+def simulate_motions(
+    outfit: OutfitConfig,
+    folder: Path,
+    motions: dict[str, Sequence[Motion]],
+    workers: int = 1,
+    travel: TravelConfig | None = None,
+    gates: GateConfig | None = None,
+) -> list[FrameReport]:
+    """Simulates continuous sequences: every frame follows from the one before; whole sequences resume.
+
+    Frames that miss a gate are written too, since a gap would break the sequence, and reported.
+
+    Args:
+        outfit, folder, workers, travel, gates: as `simulate_outfit`.
+        motions: sequences of each split.
+    """
+    travel, gates = travel or TravelConfig(), gates or GateConfig()
+    with one_thread():
+        dressed = dress(outfit, travel)
+        write_outfit(dressed, folder, gates)
+        jobs = [(motion, folder / split) for split, named in motions.items() for motion in named]
+        jobs = [job for job in jobs if not is_recorded(*job, len(dressed.labels))]
+        bar = {"total": len(jobs), "desc": f"{outfit.name} on {outfit.shape}", "unit": "sequence"}
+        if workers == 1 or len(jobs) < 2:
+            reports = [record_motion(dressed, *job, gates) for job in tqdm(jobs, **bar)]
+        else:
+            with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (outfit, travel, gates)) as pool:
+                futures = [pool.submit(_play_in_worker, *job) for job in jobs]
+                reports = [future.result() for future in tqdm(as_completed(futures), **bar)]
+    write_manifest(folder)
+    return [report for part in reports for report in part]
+
+
+def is_recorded(motion: Motion, folder: Path, vertex_count: int) -> bool:
+    """Whether all frames of a sequence are there and sound."""
+    names = frame_names(motion)
+    return all(is_sound(folder / f"{n}.npz", pose, vertex_count) for n, pose in zip(names, motion.poses))
