@@ -39,7 +39,7 @@ def test_every_method_and_size_gives_its_settings(method, size):
     chosen = find_method(config.method.name)
     settings = settings_from_dict(chosen.settings, config.method.settings)
     assert config.method.variant == method
-    assert config.train.points == {"full": 50_000, "small": 10_000}[size]
+    assert config.train.points == {"full": 50_000, "small": 5_000}[size]
     assert settings.pose == (method != "static")
     assert settings.template == (method != "csf")
     assert settings.code_channels == {"full": 64, "small": 16}[size]

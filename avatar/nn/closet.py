@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.surface import interpolate
+from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.nn.decoders import Decoded, DecoderConfig, ShapeDecoder
 from avatar.nn.pointnet2 import PointNet2, PointNet2Config
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
@@ -64,6 +64,7 @@ class ClosetAvatar(nn.Module):
         super().__init__()
         self.config = config
         self.register_buffer("vertices", template.vertices.clone(), persistent=False)
+        self.register_buffer("skin_normals", vertex_normals(template.vertices, template.faces), persistent=False)
         codes = torch.randn(outfits, len(template.vertices), config.code_channels) * config.code_std
         self.codes = nn.Parameter(codes)
         self.garment_encoder = PointNet2(template, config.code_channels, config.garment_encoder)
@@ -86,6 +87,11 @@ class ClosetAvatar(nn.Module):
             pose_vertices = pose_vertices + torch.randn_like(pose_vertices) * self.config.pose_noise
         pose = interpolate(self.pose_encoder(pose_vertices), samples)
         return self.pose_decoder(torch.cat([pose, garment], dim=-1))
+
+    def skin(self, samples: SurfaceSamples) -> Decoded:
+        """The bare body, which both decoders correct: no offset, and the body's own normals ``(1, N, 3)``."""
+        normals = interpolate(self.skin_normals, samples)[None]
+        return Decoded(torch.zeros_like(normals), normals)
 
     def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
         """Predicts the dressed surface of each frame at the sampled template points.
@@ -110,7 +116,7 @@ class ClosetAvatar(nn.Module):
             parts.append(Decoded(decoded.offsets[row], decoded.normals[row]))
         if self.config.pose and wrinkles:
             parts.append(self.decode_wrinkles(batch.pose_vertices, garment[row], samples))
-        local = sum(parts[1:], parts[0])
+        local = sum(parts, self.skin(samples))
 
         scale = self.config.offset_scale
         offsets = (local.offsets * scale).float()
@@ -136,5 +142,6 @@ class ClosetAvatar(nn.Module):
         if not self.config.template:
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")
         decoded = self.garment_decoder(self.surface_features(self.codes[outfit : outfit + 1], samples))
-        points = interpolate(self.vertices, samples) + decoded.offsets * self.config.offset_scale
-        return Decoded(points, normalize(decoded.normals, dim=-1))
+        dressed = self.skin(samples) + decoded
+        points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
+        return Decoded(points, normalize(dressed.normals, dim=-1))

@@ -111,3 +111,17 @@ def test_registry_names_its_methods():
     with pytest.raises(AvatarError, match="ClosetConfig"):
         build_avatar("closet", TEMPLATE, 1, DECODER)
     assert isinstance(build_avatar("closet", TEMPLATE, 1, small_config()), ClosetAvatar)
+
+
+def test_without_offsets_the_prediction_is_the_bare_body_with_its_normals():
+    batch, samples = random_batch(), template_points()
+    model = avatar()
+    for decoder in (model.garment_decoder, model.pose_decoder):
+        for branch in (decoder.offset_branch, decoder.normal_branch):
+            torch.nn.init.zeros_(branch[-1].weight)
+            torch.nn.init.zeros_(branch[-1].bias)
+    prediction = model(batch, samples)
+    torch.testing.assert_close(prediction.points, interpolate(batch.vertices, samples))
+    skin = interpolate(TEMPLATE.vertices, samples)  # a sphere's normals point as its points do
+    expected = torch.nn.functional.normalize(skin @ batch.vertex_transforms[:, 0, :3, :3].transpose(1, 2), dim=-1)
+    assert ((prediction.normals * expected).sum(dim=-1) > 0.98).all()
