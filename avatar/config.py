@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from avatar.checks import AvatarError
 from avatar.nn.methods import METHODS
+from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.demo import DemoConfig
 from avatar.pipeline.reporting import ReportConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig
@@ -34,6 +35,7 @@ VERBS = {
     "fit": FitConfig,
     "predict": PredictConfig,
     "evaluate": EvaluateConfig,
+    "compare": CompareConfig,
     "mesh": MeshConfig,
     "export": ExportConfig,
     "report": ReportConfig,

@@ -14,6 +14,7 @@ from avatar.evaluation.scoring import ScoreConfig
 from avatar.io.meshes import read_mesh
 from avatar.io.motions import write_motion
 from avatar.io.points import read_points
+from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.demo import DemoConfig, demo
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
@@ -144,6 +145,19 @@ def test_foreign_predictions_are_scored_from_their_folder(job, capsys):
     assert "theirs" in capsys.readouterr().out
     with pytest.raises(DataError, match=r"no such folder.*tools/predict\.py"):
         evaluate(replace(settings, predictions=folder / "none"))
+
+
+def test_runs_are_compared_in_one_table_with_their_floors(job, tmp_path):
+    config, summary = job
+    settings = CompareConfig(
+        table="tiny", runs_root=config.runs_root, dataset=config.dataset, metrics=("cd_point",), out=tmp_path
+    )
+    text = compare(settings).read_text()
+    assert "excess" in text and all(method in text for method in ("sampling", "body", "static", "closet"))
+    rows = {(row.method, row.metric): row.value for row in read_scores(tmp_path / "tiny.csv").rows}
+    assert rows == {(row["method"], row["metric"]): row["value"] for row in summary["metrics"]}
+    with pytest.raises(AvatarError, match=r"no scores below.*tools/evaluate\.py"):
+        compare(replace(settings, runs_root=tmp_path))
 
 
 def test_what_was_not_made_yet_is_named(job):
