@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from training.test_runs import SETTINGS
 
 from avatar.checks import AvatarError, DataError
@@ -104,6 +105,8 @@ def test_report_opens_in_a_browser_with_its_pictures(job, browser):
         )
         assert spread > 20  # many grey levels: not blank
     page.close()
+    sheet = np.asarray(Image.open(Path(summary["made"]["report"]).with_name("pictures.png")))
+    assert sheet.shape[1] > 4 * 600 and sheet.std() > 10
 
 
 def test_going_on_with_a_finished_job_repeats_nothing(job):

@@ -9,10 +9,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from avatar.data.outfits import Outfit
-from avatar.evaluation.report import Picture, PictureRow, ReportContent, write_report
+from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent, write_report
 from avatar.evaluation.scores import Scores
 from avatar.evaluation.tables import View, metric_table, outfit_table
-from avatar.export.pictures import color_bar, frame_camera, render_error, render_mesh, render_points
+from avatar.export.pictures import (
+    color_bar,
+    contact_sheet,
+    frame_camera,
+    render_error,
+    render_mesh,
+    render_points,
+    save_picture,
+)
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.pipeline.scores import predictions_folder, read_all_scores, run_outfits
@@ -36,7 +44,10 @@ class ReportConfig:
 
 
 def report(config: ReportConfig) -> Path:
-    """Writes ``<run>/report.html``; what has not been predicted, meshed or scored is said to be missing."""
+    """Writes ``<run>/report.html`` and, as one picture, ``<run>/pictures.png``.
+
+    What has not been predicted, meshed or scored is said to be missing on the page.
+    """
     avatar = load_run(config.run)
     scores = gather_scores(config, avatar)
     rows: list[PictureRow] = []
@@ -44,6 +55,7 @@ def report(config: ReportConfig) -> Path:
         names = spaced_frames(list(outfit.frames(config.split)), config.frames)
         rows += [pose_pictures(config, avatar, outfit, name) for name in names]
         rows += template_pictures(avatar, outfit)
+    save_picture(config.run / "pictures.png", picture_sheet(rows))
     tables = [metric_table(scores.rows, name) for name in dict.fromkeys(row.outfit for row in scores.rows)]
     if {"sampling"} <= {row.method for row in scores.rows}:
         tables.append(outfit_table(scores.rows, "cd_point", View.EXCESS))
@@ -113,6 +125,14 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
     if mesh.is_file():
         pictures[3] = Picture(render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
     return PictureRow(f"{outfit.name}: {name}", tuple(pictures))
+
+
+def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
+    """The poses' pictures as one, without the error column; empty where one could not be made."""
+    shown = [row.pictures[:-1] for row in rows if row.pictures[0] is not None]
+    blank = np.full_like(shown[0][0].image, 255)
+    images = [[blank if picture is None else picture.image for picture in row] for row in shown]
+    return contact_sheet(images, column_labels=COLUMNS[:-1])
 
 
 def posed_template(avatar: TrainedAvatar, outfit: str, frame: Frame) -> PointCloud:

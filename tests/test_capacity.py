@@ -1,0 +1,44 @@
+"""The model can represent what it sees: one scan, learned by heart, comes back to the distance of two samplings."""
+
+import pytest
+import torch
+from training.test_runs import SETTINGS, distance
+
+from avatar.data.batches import FrameDataset, FrameName
+from avatar.data.layouts import find_outfit
+from avatar.nn.closet import ClosetAvatar, ClosetConfig
+from avatar.settings import settings_from_dict
+from avatar.training.loop import Schedule, TrainConfig, Trainer
+from avatar.training.losses import LossConfig
+from avatar.training.prediction import body_batch, predict, template_samples
+
+POINTS = 12_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("outfit", ["tee"])
+def test_one_frame_is_learned_to_within_half_of_the_sampling_distance(tmp_path, outfit):
+    data = find_outfit(tmp_path, "sample", outfit)
+    name = data.frames("train")[0]
+    frame = data.load("train", name)
+    frames = FrameDataset([data], [FrameName(0, "train", name)], 8000)
+    config = TrainConfig(
+        steps=350,
+        batch=1,
+        points=8000,
+        fresh_points=True,
+        lr=4e-3,
+        code_lr=1e-2,
+        schedule=Schedule.cosine,
+        validate_every=1000,
+        save_every=1000,
+        loss=LossConfig(offset=1, normal_start=0.3),
+    )
+    torch.manual_seed(0)
+    model = ClosetAvatar(data.template, 1, settings_from_dict(ClosetConfig, SETTINGS))
+    trainer = Trainer(model, data.template.vertices, data.template.faces, config, tmp_path)
+    trainer.fit(lambda step: frames.batch_at(step, 1), 1, lambda: iter(()))
+    cloud = predict(model.eval(), body_batch([frame.body], 0, (name,)), template_samples(data.template, POINTS))
+    scan = data.resample("train", name, POINTS, seed=7).points
+    floor = distance(data.resample("train", name, POINTS, seed=8).points, scan)
+    assert distance(cloud.points, scan) < 1.5 * floor
