@@ -7,6 +7,7 @@ a config never names code.
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -67,6 +68,7 @@ def command(verb: str, run: Callable[[Any], Any]) -> None:
     go on, and the failed ones are named again at the end.
     """
     register()
+    logging.basicConfig(level=logging.INFO, format="%(message)s")  # what verbs report; conf/hydra keeps Hydra quiet
     failures: list[str] = []
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=verb)

@@ -2,13 +2,14 @@
 
 import pytest
 import torch
-from training.test_runs import SETTINGS, distance
+from tiny import SETTINGS, quick_training
+from training.test_runs import distance
 
 from avatar.data.batches import FrameDataset, FrameName
 from avatar.data.layouts import find_outfit
 from avatar.nn.closet import ClosetAvatar, ClosetConfig
 from avatar.settings import settings_from_dict
-from avatar.training.loop import Schedule, TrainConfig, Trainer
+from avatar.training.loop import Trainer
 from avatar.training.losses import LossConfig
 from avatar.training.prediction import body_batch, predict, template_samples
 
@@ -22,17 +23,9 @@ def test_one_frame_is_learned_to_within_half_of_the_sampling_distance(tmp_path, 
     name = data.frames("train")[0]
     frame = data.load("train", name)
     frames = FrameDataset([data], [FrameName(0, "train", name)], 8000)
-    config = TrainConfig(
-        steps=350,
-        batch=1,
-        points=8000,
-        fresh_points=True,
-        lr=4e-3,
-        code_lr=1e-2,
-        schedule=Schedule.cosine,
-        validate_every=1000,
-        save_every=1000,
-        loss=LossConfig(offset=1, normal_start=0.3),
+    loss = LossConfig(offset=1, normal_start=0.3)
+    config = quick_training(
+        steps=350, batch=1, points=8000, scan_points=8000, lr=4e-3, validate_every=1000, save_every=1000, loss=loss
     )
     torch.manual_seed(0)
     model = ClosetAvatar(data.template, 1, settings_from_dict(ClosetConfig, SETTINGS))

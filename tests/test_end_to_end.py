@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from training.test_runs import SETTINGS
+from tiny import SETTINGS, quick_training
 
 from avatar.checks import AvatarError, DataError
 from avatar.evaluation.scores import read_scores
@@ -20,8 +20,6 @@ from avatar.pipeline.demo import DemoConfig, demo
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
 from avatar.simulate.sequences import authored_motion
-from avatar.training.loop import Schedule, TrainConfig
-from avatar.training.losses import LossConfig
 from avatar.training.runs import MethodChoice
 
 pytestmark = pytest.mark.slow
@@ -31,18 +29,7 @@ METRICS = ["cd_point", "cd_pop", "normal_l1", "penetration_share"]
 @pytest.fixture(scope="module")
 def job(tiny_folder, tmp_path_factory) -> tuple[DemoConfig, dict]:
     """The settings of a finished main job and its summary."""
-    train = TrainConfig(
-        steps=120,
-        points=2000,
-        scan_points=2000,
-        batch=2,
-        fresh_points=True,
-        lr=5e-3,
-        code_lr=1e-2,
-        schedule=Schedule.cosine,
-        validate_every=60,
-        loss=LossConfig(offset=20, normal_start=0.2),
-    )
+    train = quick_training(steps=120, points=2000, scan_points=2000, validate_every=60)
     config = DemoConfig(
         method=MethodChoice("closet", "closet", SETTINGS),
         dataset=tiny_folder.parent.name,

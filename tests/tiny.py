@@ -11,6 +11,19 @@ from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.io.frames import OpenFrame, OpenGarment, write_manifest, write_open_frame, write_open_garment
 from avatar.simulate.angles import pose_from_angles
+from avatar.training.loop import Schedule, TrainConfig
+from avatar.training.losses import LossConfig
+
+HIERARCHY = {"points": [256, 64], "radii": [0.3, 1.0], "neighbours": 16}
+ENCODER = {"hierarchy": HIERARCHY, "abstraction": [[16, 16], [32, 32]], "propagation": [[32], [16]]}
+DECODER = {"width": 48, "trunk": 2, "branch": 0}
+SETTINGS = {
+    "pose_encoder": ENCODER,
+    "garment_encoder": ENCODER,
+    "garment_decoder": DECODER,
+    "pose_decoder": DECODER,
+    "code_channels": 4,
+}
 
 EASE = 0.02  # metres between body and cloth
 BULGE = 0.05  # metres by which the belly and hips bulge at the far end of the poses
@@ -64,3 +77,9 @@ def write_tiny_outfit(folder: Path) -> Path:
             write_open_frame(folder / split / f"{sequence}.{number:05d}.npz", frame)
     write_manifest(folder)
     return folder
+
+
+def quick_training(**options) -> TrainConfig:
+    """Training that learns the tiny outfit in seconds."""
+    defaults = {"batch": 2, "fresh_points": True, "lr": 5e-3, "code_lr": 1e-2, "schedule": Schedule.cosine}
+    return TrainConfig(**(defaults | {"loss": LossConfig(offset=20, normal_start=0.3)} | options))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,7 @@ from avatar.evaluation.scores import Scores, read_scores, write_scores
 from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
 from avatar.io.motions import read_motion
+from avatar.io.npz import write_whole
 from avatar.training.prediction import predict_frames, predict_motion
 from avatar.training.runs import TrainedAvatar, load_run
 
@@ -128,17 +130,19 @@ def score_runs(config: EvaluateConfig) -> Scores:
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
     """The sampling floor and the bare body for one outfit, kept in a file for the next method.
 
-    The file serves again when it was made with the same points, metrics and seed.
+    The file serves again when it was made with the same points, metrics, seed, scanner and data (by manifest).
     """
     beside = path.with_suffix(".settings.txt")
-    key = f"{config.split} {points} {config.score}"
+    manifest = outfit.path / "manifest.json"
+    data = hashlib.sha256(manifest.read_bytes()).hexdigest() if manifest.is_file() else outfit.path.resolve()
+    key = f"{config.split} {points} {config.score} {getattr(outfit, 'scanner', None)} {data}"
     if path.is_file() and beside.is_file() and beside.read_text() == key:
         return read_scores(path)
     commit = current_commit()
     floors = score_sampling_floor(outfit, config.split, config.score, points, commit=commit)
     floors = floors + score_body_floor(outfit, config.split, config.score, points, commit=commit)
     write_scores(path, floors)
-    beside.write_text(key)
+    write_whole(beside, key.encode())
     return floors
 
 

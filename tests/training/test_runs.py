@@ -6,43 +6,19 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from tiny import SETTINGS, quick_training
 
 from avatar.checks import AvatarError, DataError
 from avatar.data.splits import SplitConfig
 from avatar.io.points import read_points
 from avatar.simulate.sequences import authored_motion
-from avatar.training.loop import Schedule, TrainConfig
-from avatar.training.losses import LossConfig
 from avatar.training.prediction import body_batch, predict, predict_frames, predict_motion, template_samples
 from avatar.training.runs import MethodChoice, RunConfig, choose_device, load_run, train_run
-
-HIERARCHY = {"points": [256, 64], "radii": [0.3, 1.0], "neighbours": 16}
-ENCODER = {"hierarchy": HIERARCHY, "abstraction": [[16, 16], [32, 32]], "propagation": [[32], [16]]}
-DECODER = {"width": 48, "trunk": 2, "branch": 0}
-SETTINGS = {
-    "pose_encoder": ENCODER,
-    "garment_encoder": ENCODER,
-    "garment_decoder": DECODER,
-    "pose_decoder": DECODER,
-    "code_channels": 4,
-}
 
 
 @pytest.fixture(scope="module")
 def settings(tiny_folder, tmp_path_factory) -> RunConfig:
-    train = TrainConfig(
-        steps=260,
-        points=3000,
-        scan_points=3000,
-        batch=2,
-        fresh_points=True,
-        lr=5e-3,
-        code_lr=1e-2,
-        schedule=Schedule.cosine,
-        validate_every=130,
-        save_every=130,
-        loss=LossConfig(offset=20, normal_start=0.3),
-    )
+    train = quick_training(steps=260, points=3000, scan_points=3000, validate_every=130, save_every=130)
     return RunConfig(
         method=MethodChoice("closet", "closet", SETTINGS),
         dataset=tiny_folder.parent.name,
