@@ -16,7 +16,8 @@ class Template:
 
     ``vertices (V, 3)``, ``faces (F, 3)`` int64, ``weights (V, J)`` skinning weights with rows summing to 1,
     ``joints (J, 3)`` joint positions in the canonical pose, ``parents`` with -1 for the root and every parent
-    before its children, ``joint_names``.
+    before its children, ``joint_names``. ``canonical_from_bind (J, 4, 4)`` is each joint's rigid motion from the
+    pose in which the weights were painted, or None where that pose is the canonical one; `skin_transforms` needs it.
     """
 
     vertices: Tensor
@@ -25,10 +26,12 @@ class Template:
     joints: Tensor
     parents: tuple[int, ...]
     joint_names: tuple[str, ...]
+    canonical_from_bind: Tensor | None = None
 
     def to(self, *args, **kwargs) -> Template:
         """The same template with its floating-point tensors moved or cast, and its faces moved only."""
-        moved = {name: getattr(self, name).to(*args, **kwargs) for name in ("vertices", "weights", "joints")}
+        names = ("vertices", "weights", "joints", "canonical_from_bind")
+        moved = {name: getattr(self, name).to(*args, **kwargs) for name in names if getattr(self, name) is not None}
         return replace(self, **moved, faces=self.faces.to(moved["vertices"].device))
 
 
@@ -70,7 +73,8 @@ class Scan:
 
     ``points (M, 3)`` metres, ``normals (M, 3)`` unit; ``faces (F, 3)`` where the scan is a mesh over its points;
     ``labels (M,)`` which surface a point lies on (0 is skin, then one number a garment); ``canonical (M, 3)`` the
-    point's true position on the garment at rest in the canonical pose (simulated data only).
+    point's true position on the garment at rest in the canonical pose (simulated data only); ``colors (M, 3)`` in
+    [0, 1] where the scan is coloured.
     """
 
     points: np.ndarray
@@ -78,6 +82,24 @@ class Scan:
     faces: np.ndarray | None = None
     labels: np.ndarray | None = None
     canonical: np.ndarray | None = None
+    colors: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class CanonicalScan:
+    """A posed scan carried to the canonical pose: a partial T-pose scan (SCANimate 3.1).
+
+    ``points (M, 3)`` metres, ``normals (M, 3)`` unit, ``weights (M, J)`` the skinning weights it was carried with,
+    ``faces (F, 3)`` without those that were stretched where the scan is a mesh, ``colors (M, 3)`` where it has them.
+    Points whose triangles were all cut are left out; ``source (M,)`` is the index of each in the posed scan.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    weights: np.ndarray
+    source: np.ndarray
+    faces: np.ndarray | None = None
+    colors: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -89,6 +89,7 @@ class BodyModel(nn.Module):
             "corrected_bind_vertices": corrected,
             "canonical_vertices": transform_points(vertex_canonical_from_bind, corrected),
             "canonical_joints": transform_points(canonical_from_bind, bind.joints),
+            "canonical_from_bind": canonical_from_bind,
         }.items():
             self.register_buffer(name, value.clone(), persistent=False)
 
@@ -96,7 +97,13 @@ class BodyModel(nn.Module):
     def template(self) -> Template:
         """The body at rest in its canonical pose."""
         return Template(
-            self.canonical_vertices, self.faces, self.weights, self.canonical_joints, self.parents, self.joint_names
+            self.canonical_vertices,
+            self.faces,
+            self.weights,
+            self.canonical_joints,
+            self.parents,
+            self.joint_names,
+            self.canonical_from_bind,
         )
 
     def with_canonical_pose(self, canonical_pose: Tensor) -> BodyModel:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ OPTIONAL_KEYS = {
     "weight_joints": "int V K",
     "weight_values": "number V K",
     "joints": "float J 3",
+    "canonical_from_bind": "float J 4 4",
     **BIND_KEYS,
 }
 
@@ -92,6 +94,9 @@ def read_template(path: Path) -> Template:
     arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
     try:
         template = _template(arrays, arrays["vertices"], arrays.get("joints"))
+        if "canonical_from_bind" in arrays:
+            bound = torch.from_numpy(arrays["canonical_from_bind"].astype(np.float32))
+            template = replace(template, canonical_from_bind=bound)
         check_bind(template)
     except AvatarError as error:
         raise DataError(path, str(error)) from error
@@ -140,7 +145,8 @@ def packed_body(path: Path) -> BodyModel:
 def _template_arrays(template: Template) -> dict[str, np.ndarray]:
     """A template as the arrays of its file."""
     ids, values = sparse_weights(template.weights.cpu().numpy())
-    return {
+    bound = template.canonical_from_bind
+    return ({} if bound is None else {"canonical_from_bind": bound.cpu().numpy()}) | {
         "vertices": template.vertices.cpu().numpy(),
         "faces": template.faces.cpu().numpy().astype(np.int32),
         "weight_joints": ids,

@@ -45,6 +45,27 @@ def blend_transforms(weights: Tensor, joint_transforms: Tensor) -> Tensor:
     return (weights @ joint_transforms.flatten(-2)).unflatten(-1, (4, 4))
 
 
+def skin_transforms(weights: Tensor, joint_transforms: Tensor, canonical_from_bind: Tensor | None = None) -> Tensor:
+    """The blended posed_from_canonical transform of points with any skinning weights, exact on the body's own.
+
+    Weights blend motions from the pose they were painted in: a point goes back there and on to the pose with the same
+    weights, T(w) = (sum_j w_j P_j C_j) (sum_j w_j C_j)^-1, for P posed_from_canonical and C canonical_from_bind.
+    Without ``canonical_from_bind`` this is plain LBS (SCANimate eq. 1).
+
+    Args:
+        weights: ``(B, N, J)`` or ``(N, J)``, rows summing to 1.
+        joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
+        canonical_from_bind: ``(J, 4, 4)`` of the `Template`, or None.
+
+    Returns:
+        ``(B, N, 4, 4)``, differentiable in all of them.
+    """
+    if canonical_from_bind is None:
+        return blend_transforms(weights, joint_transforms)
+    posed_from_bind = blend_transforms(weights, joint_transforms @ canonical_from_bind)
+    return posed_from_bind @ invert_affine(blend_transforms(weights, canonical_from_bind))
+
+
 def pose_points(points: Tensor, weights: Tensor, joint_transforms: Tensor) -> Tensor:
     """Forward LBS of canonical points. ``(B, N, 3)`` or ``(N, 3)``, weights ``(..., N, J)`` to ``(B, N, 3)``."""
     return transform_points(blend_transforms(weights, joint_transforms), points)

@@ -52,6 +52,7 @@ def test_round_trip_poses_the_open_body_as_it_was(tmp_path):
 def test_template_round_trip_loses_nothing_but_the_bind_pose(tmp_path):
     body, path = open_body("male").with_canonical_pose(random_pose(22)), tmp_path / "template.npz"
     write_template(path, body.template)
+    torch.testing.assert_close(read_template(path).canonical_from_bind, body.template.canonical_from_bind)
     for again in (read_template(path), packed_body(path).template):
         for name in ("vertices", "faces", "joints", "weights"):
             torch.testing.assert_close(getattr(again, name), getattr(body.template, name), atol=1e-6, rtol=0)

@@ -4,7 +4,15 @@ import pytest
 import torch
 from bodies import random_bind, random_pose
 
-from avatar.body.skinning import blend_transforms, chain_transforms, check_parents, pose_points, unpose_points
+from avatar.body.open import open_body
+from avatar.body.skinning import (
+    blend_transforms,
+    chain_transforms,
+    check_parents,
+    pose_points,
+    skin_transforms,
+    unpose_points,
+)
 from avatar.checks import AvatarError
 from avatar.geometry.transforms import rotation_from_axis_angle, transform_points
 
@@ -60,3 +68,14 @@ def test_gradients_of_pose_and_unpose():
 def test_trees_out_of_order_are_refused(parents):
     with pytest.raises(AvatarError, match="parents: expected -1 first"):
         check_parents(parents)
+
+
+def test_skinning_with_the_body_s_own_weights_is_the_body_s_own():
+    """Also for a body bound in another pose than its canonical one; plain LBS is not."""
+    body = open_body("female")
+    pose = 0.3 * random_pose(2, 22).float()
+    posed, template = body(pose), body.template
+    found = skin_transforms(template.weights, posed.joint_transforms, template.canonical_from_bind)
+    torch.testing.assert_close(transform_points(found, template.vertices), posed.vertices, atol=2e-6, rtol=0)
+    plain = skin_transforms(template.weights, posed.joint_transforms)
+    assert (transform_points(plain, template.vertices) - posed.vertices).norm(dim=-1).max() > 2e-3
