@@ -161,7 +161,8 @@ class Prediction:
 
     ``points (B, N, 3)`` posed, metres; ``normals (B, N, 3)`` unit; ``offsets (B, N, 3)`` r before the local
     transform; ``garment_offsets`` and ``wrinkle_offsets`` its two parts (CloSET eq. 3; the first is None for a
-    method without explicit template); ``codes`` the garment codes used ``(B, ..., C)`` or None.
+    method without explicit template); ``wrinkle_normals (B, N, 3)`` what the pose adds to the garment's normals before
+    they are normalised, or None; ``codes`` the garment codes used ``(B, ..., C)`` or None.
     """
 
     points: Tensor
@@ -169,6 +170,7 @@ class Prediction:
     offsets: Tensor
     garment_offsets: Tensor | None = None
     wrinkle_offsets: Tensor | None = None
+    wrinkle_normals: Tensor | None = None
     codes: Tensor | None = None
 
 

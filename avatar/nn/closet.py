@@ -129,6 +129,7 @@ class ClosetAvatar(nn.Module):
             offsets=offsets,
             garment_offsets=parts[0].offsets.float() * scale if self.config.template else None,
             wrinkle_offsets=parts[-1].offsets.float() * scale if self.config.pose and wrinkles else None,
+            wrinkle_normals=parts[-1].normals.float() if self.config.pose and wrinkles else None,
             codes=codes,
         )
 

@@ -17,7 +17,7 @@ from avatar.geometry.distances import (
 )
 from avatar.records import Batch, LossTerms, Prediction
 
-TERMS = ("scan_to_points", "points_to_scan", "normal", "offset", "wrinkle", "code")
+TERMS = ("scan_to_points", "points_to_scan", "normal", "offset", "wrinkle", "wrinkle_normal", "code")
 
 
 class Chamfer(Enum):
@@ -38,7 +38,8 @@ class LossConfig:
     normal_start: float = 0.6  # share of training after which the normal term counts (POP: epoch 250 of 400)
     normal_before: float = 1e-6  # factor on the normal term until then
     offset: float = 2e3  # mean |r|^2
-    wrinkle: float = 0.0  # mean |r^p|^2
+    wrinkle: float = 0.0  # mean |r^p|^2; what all poses share then moves into the garment template
+    wrinkle_normal: float = 0.0  # the same for what the pose adds to the normals
     code: float = 1.0  # mean square of the garment codes
 
     def __post_init__(self):
@@ -79,6 +80,8 @@ def point_avatar_loss(prediction: Prediction, batch: Batch, config: LossConfig, 
     }
     if prediction.wrinkle_offsets is not None:
         raw["wrinkle"] = squared_norm(prediction.wrinkle_offsets)
+    if prediction.wrinkle_normals is not None:
+        raw["wrinkle_normal"] = squared_norm(prediction.wrinkle_normals)
     if prediction.codes is not None:
         raw["code"] = prediction.codes.square().mean()
     weights = {name: getattr(config, name) for name in raw}
@@ -88,5 +91,5 @@ def point_avatar_loss(prediction: Prediction, batch: Batch, config: LossConfig, 
 
 
 def squared_norm(offsets: Tensor) -> Tensor:
-    """Mean squared length of offsets ``(..., 3)``, square metres (CloSET eq. 6)."""
+    """Mean squared length of vectors ``(..., 3)``: of offsets in square metres (CloSET eq. 6)."""
     return offsets.square().sum(dim=-1).mean()

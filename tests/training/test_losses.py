@@ -67,11 +67,12 @@ def test_regularisers_are_mean_squares_with_their_weights():
     offsets = torch.full_like(scan, 0.1)
     wrinkles = torch.full_like(scan, 0.2)
     codes = torch.full((1, 5, 4), 0.3)
-    extra = {"offsets": offsets, "wrinkle_offsets": wrinkles, "codes": codes}
+    extra = {"offsets": offsets, "wrinkle_offsets": wrinkles, "wrinkle_normals": 2 * wrinkles, "codes": codes}
     prediction, batch = make(scan.clone(), up(scan), scan, up(scan), **extra)
-    terms = point_avatar_loss(prediction, batch, LossConfig(offset=10, wrinkle=100, code=2), 1.0)
+    terms = point_avatar_loss(prediction, batch, LossConfig(offset=10, wrinkle=100, wrinkle_normal=3, code=2), 1.0)
     assert terms.weighted["offset"].item() == pytest.approx(10 * 0.03, rel=1e-5)
     assert terms.weighted["wrinkle"].item() == pytest.approx(100 * 0.12, rel=1e-5)
+    assert terms.weighted["wrinkle_normal"].item() == pytest.approx(3 * 0.48, rel=1e-5)
     assert terms.weighted["code"].item() == pytest.approx(2 * 0.09, rel=1e-5)
     torch.testing.assert_close(terms.total, sum(terms.weighted.values()))
 
