@@ -30,6 +30,7 @@ PAD = 0.12  # metres of free grid around the body
 SHORTEST = 0.45  # shortest edge in the finished mesh, in target edge lengths, before the last relaxation
 BLUR = 0.012  # metres by which the field is smoothed
 CROTCH = 0.06  # metres of gap between the thighs that is bridged softly
+NECK_FOOT = 0.04  # metres above the neck joint where garments end at the latest
 BLEND = 0.03  # metres over which a hanging tube melts into the close-fitting part
 LEVELS = ("left_ankle", "left_knee", "left_hip", "spine1", "spine3", "neck")
 ARM_JOINTS = ("shoulder", "elbow", "wrist")
@@ -166,7 +167,7 @@ def cuts(cutting: Cutting, config: GarmentConfig) -> list:
     if config.top is not None:
         top = cutting.height(config.top)
         return [*made, lambda v, arm: v[:, 1] - top]
-    made.append(neckline(cutting, config))
+    made += neckline(cutting, config)
     for side in ("left", "right"):
         chain = np.stack([cutting.joints[f"{side}_{joint}"] for joint in ARM_JOINTS])
         start = min(int(config.sleeve), 1)
@@ -184,8 +185,12 @@ def cuts(cutting: Cutting, config: GarmentConfig) -> list:
     return made
 
 
-def neckline(cutting: Cutting, config: GarmentConfig):
-    """The cut of a round neck: an upright elliptic cylinder around the neck, a little deeper in front."""
+def neckline(cutting: Cutting, config: GarmentConfig) -> list:
+    """The cuts of a round neck: an upright elliptic cylinder around the neck, a little deeper in front.
+
+    Loose cloth melts into what lies under the chin and would stay on the face: a second cut takes what is left above
+    the neck's foot, and what is left in front of the neck above the collarbones.
+    """
     neck, head = cutting.joints["neck"], cutting.joints["head"]
     (half, back, _), (_, _, front) = cutting.profile(np.array([(neck[1] + head[1]) / 2, neck[1] - 0.085]))
     back -= max(0.012, config.ease - 0.002)
@@ -193,8 +198,13 @@ def neckline(cutting: Cutting, config: GarmentConfig):
     radii = np.array([half, (front - back) / 2]) + config.neck
     centre = (front + back) / 2
 
-    def cut(v, arm):
+    def round_neck(v, arm):
         radius = np.hypot(v[:, 0] / radii[0], (v[:, 2] - centre) / radii[1])
         return np.where(v[:, 1] > neck[1] - 0.15, (1 - radius) * radii.min(), -1.0)
 
-    return cut
+    def chin(v, arm):
+        before = np.minimum(0.8 * radii[0] - np.abs(v[:, 0]), v[:, 2] - centre - 0.6 * radii[1])
+        before = np.minimum(before, v[:, 1] - neck[1] + 0.03)
+        return np.where(arm < 0.5, np.maximum(before, v[:, 1] - neck[1] - NECK_FOOT), -1.0)
+
+    return [round_neck, chin]

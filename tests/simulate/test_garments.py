@@ -7,7 +7,7 @@ import trimesh
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
-from avatar.simulate.garments import Cutting, cut_garment
+from avatar.simulate.garments import NECK_FOOT, Cutting, cut_garment
 from avatar.simulate.implicit import mesh_edges
 from avatar.simulate.outfits import GARMENTS, OUTFIT_NAMES, FabricConfig, GarmentConfig, outfit
 from avatar.simulate.visibility import body_distances
@@ -26,7 +26,7 @@ def coarse(name: str, index: int) -> GarmentConfig:
 
 @pytest.mark.parametrize(
     ("name", "index", "shape"),
-    [("tee", 0, "female"), ("tee", 1, "male"), ("shirt", 1, "male"), ("skirt", 0, "female"), ("jacket", 2, "female")],
+    [("tee", 0, "female"), ("tee", 1, "male"), ("shirt", 1, "male"), ("skirt", 0, "female"), ("jacket", 2, "male")],
 )
 def test_cut_garments_are_clean_and_outside(name, index, shape):
     body = open_body(shape)
@@ -43,6 +43,8 @@ def test_cut_garments_are_clean_and_outside(name, index, shape):
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     shape_factor = 4 * np.sqrt(3) * mesh.area_faces / (sides**2).sum(1)
     assert shape_factor.min() > 0.35  # 1 for an equilateral triangle, 0 for a sliver
+    if config.top is None:  # nothing is left on the face
+        assert garment.vertices[:, 1].max() < Cutting.of(body).joints["neck"][1] + NECK_FOOT + 0.01
     away = body_distances(body.bind_vertices.numpy(), body.faces.numpy(), garment.vertices, 0.1)
     assert away.min() > config.fabric.thickness - 1e-4
     outward = (mesh.vertex_normals * (garment.vertices - [0, garment.vertices[:, 1].mean(), 0])).sum(1)
