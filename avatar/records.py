@@ -18,6 +18,7 @@ class Template:
     ``joints (J, 3)`` joint positions in the canonical pose, ``parents`` with -1 for the root and every parent
     before its children, ``joint_names``. ``canonical_from_bind (J, 4, 4)`` is each joint's rigid motion from the
     pose in which the weights were painted, or None where that pose is the canonical one; `skin_transforms` needs it.
+    ``uv (U, 2)`` in [0, 1] and ``uv_faces (F, 3)``, each corner's index into it, are None for a body without atlas.
     """
 
     vertices: Tensor
@@ -27,12 +28,16 @@ class Template:
     parents: tuple[int, ...]
     joint_names: tuple[str, ...]
     canonical_from_bind: Tensor | None = None
+    uv: Tensor | None = None
+    uv_faces: Tensor | None = None
 
     def to(self, *args, **kwargs) -> Template:
         """The same template with its floating-point tensors moved or cast, and its faces moved only."""
-        names = ("vertices", "weights", "joints", "canonical_from_bind")
+        names = ("vertices", "weights", "joints", "canonical_from_bind", "uv")
         moved = {name: getattr(self, name).to(*args, **kwargs) for name in names if getattr(self, name) is not None}
-        return replace(self, **moved, faces=self.faces.to(moved["vertices"].device))
+        device = moved["vertices"].device
+        whole = {name: getattr(self, name) for name in ("faces", "uv_faces")}
+        return replace(self, **moved, **{name: ids if ids is None else ids.to(device) for name, ids in whole.items()})
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,9 @@ class Batch:
 
     ``pose_vertices (B, V, 3)`` encoder input, ``vertices (B, V, 3)`` posed body, ``vertex_transforms
     (B, V, 4, 4)``, ``joint_transforms (B, J, 4, 4)``, ``scan_points (B, M, 3)``, ``scan_normals (B, M, 3)``,
-    ``outfit_ids (B,)`` int64 index into the run's outfits, ``names``.
+    ``outfit_ids (B,)`` int64 index into the run's outfits, ``names``. ``canonical`` is True where ``vertices``,
+    ``vertex_transforms`` and scans are those of the canonical pose (training in canonical space); what tells the
+    pose, ``pose_vertices`` and ``joint_transforms``, is the posed body's all the same.
     """
 
     pose_vertices: Tensor
@@ -148,11 +155,12 @@ class Batch:
     scan_normals: Tensor
     outfit_ids: Tensor
     names: tuple[str, ...]
+    canonical: bool = False
 
     def to(self, device: torch.device | str) -> Batch:
         """The same batch on another device."""
-        moved = {f.name: getattr(self, f.name).to(device) for f in fields(self) if f.name != "names"}
-        return Batch(**moved, names=self.names)
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)})
 
 
 @dataclass(frozen=True)
@@ -189,10 +197,14 @@ class LossTerms:
 
 @dataclass(frozen=True)
 class PointCloud:
-    """An oriented point cloud on disk or about to be: ``points (N, 3)``, ``normals (N, 3)``."""
+    """An oriented point cloud on disk or about to be: ``points (N, 3)``, ``normals (N, 3)``.
+
+    ``colors (N, 3)`` in [0, 1] where it has them.
+    """
 
     points: np.ndarray
     normals: np.ndarray
+    colors: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Records: what moves with a device or dtype and what stays, and that none can be changed in place."""
 
-from dataclasses import FrozenInstanceError, fields
+from dataclasses import FrozenInstanceError, fields, replace
 
 import pytest
 import torch
@@ -23,6 +23,8 @@ def test_template_casts_numbers_and_leaves_indices():
     wide = template().to(torch.float64)
     assert {wide.vertices.dtype, wide.weights.dtype, wide.joints.dtype} == {torch.float64}
     assert wide.faces.dtype == torch.int64 and wide.joint_names == ("root",)
+    atlas = replace(template(), uv=torch.rand(3, 2), uv_faces=torch.tensor([[0, 1, 2]])).to(torch.float64)
+    assert (atlas.uv.dtype, atlas.uv_faces.dtype) == (torch.float64, torch.int64)
     away = template().to("meta")
     assert {tensor.device.type for tensor in (away.vertices, away.faces, away.weights, away.joints)} == {"meta"}
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from avatar.body.atlas import toeless_atlas
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.skinning import chain_transforms
 from avatar.checks import AvatarError, require
@@ -64,6 +66,7 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
             ancestor = model.bone_parents[ancestor]
         influence = torch.where(model.vertex_bone_indices == bone, model.vertex_bone_weights, 0).sum(dim=1)
         weights[:, MIXAMO_NAMES.index(labels[ancestor])] += influence
+    uv, uv_faces = anny_atlas(model, topology)
     y_up = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     heads = rest["rest_bone_heads"][0, [labels.index(name) for name in MIXAMO_NAMES]]
     return Template(
@@ -73,7 +76,19 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
         joints=(heads @ y_up.T).float(),
         parents=SMPL_PARENTS,
         joint_names=tuple(SMPL_JOINTS),
+        uv=uv,
+        uv_faces=uv_faces,
     )
+
+
+def anny_atlas(model: Any, topology: str) -> tuple[Tensor, Tensor] | tuple[None, None]:
+    """UV coordinates ``(U, 2)`` and corner indices ``(F, 3)`` of an anny model; None for a decimated topology."""
+    if model.texture_coordinates is not None:
+        return model.texture_coordinates.float(), model.face_texture_coordinate_indices.long()
+    if topology != "notoes":
+        return None, None
+    uv, uv_faces = toeless_atlas(model.faces.numpy())
+    return torch.from_numpy(uv).float(), torch.from_numpy(uv_faces)
 
 
 def t_pose_from_bind(bind: Template) -> Tensor:

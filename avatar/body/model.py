@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -15,6 +17,7 @@ from avatar.geometry.transforms import (
     transform_directions,
     transform_points,
 )
+from avatar.geometry.uv import check_atlas
 from avatar.records import PosedBody, Template
 
 SMPL_JOINTS = (  # noqa: SIM905
@@ -90,8 +93,10 @@ class BodyModel(nn.Module):
             "canonical_vertices": transform_points(vertex_canonical_from_bind, corrected),
             "canonical_joints": transform_points(canonical_from_bind, bind.joints),
             "canonical_from_bind": canonical_from_bind,
+            "uv": bind.uv,
+            "uv_faces": bind.uv_faces,
         }.items():
-            self.register_buffer(name, value.clone(), persistent=False)
+            self.register_buffer(name, None if value is None else value.clone(), persistent=False)
 
     @property
     def template(self) -> Template:
@@ -104,11 +109,13 @@ class BodyModel(nn.Module):
             self.parents,
             self.joint_names,
             self.canonical_from_bind,
+            self.uv,
+            self.uv_faces,
         )
 
     def with_canonical_pose(self, canonical_pose: Tensor) -> BodyModel:
         """The same body with another canonical space, ``(J, 3)`` axis-angle relative to the T-pose."""
-        bind = Template(self.bind_vertices, self.faces, self.weights, self.bind_joints, self.parents, self.joint_names)
+        bind = replace(self.template, vertices=self.bind_vertices, joints=self.bind_joints, canonical_from_bind=None)
         return BodyModel(bind, self.zero_from_bind, canonical_pose, self.pose_directions)
 
     def pose_displacements(self, pose: Tensor) -> Tensor:
@@ -184,4 +191,6 @@ def check_bind(bind: Template) -> dict[str, int]:
     lowest, highest = int(bind.faces.min()), int(bind.faces.max())
     if lowest < 0 or highest >= dims["V"]:
         raise AvatarError(f"faces: expected indices in [0, {dims['V']}), got {lowest} to {highest}.")
+    if bind.uv is not None or bind.uv_faces is not None:
+        check_atlas(bind.uv, bind.uv_faces, len(bind.faces))
     return dims

@@ -17,6 +17,7 @@ from avatar.records import Template
 
 ASSET = Path(__file__).parents[1] / "assets" / "open_body.npz"
 MEAN_SHAPE = "mean"  # the average of all shapes: what a pose encoder sees, whoever wears the garment
+UV_STEPS = 65535
 KEPT_WEIGHTS = 5  # with 16 bits each they pose within 0.02 mm of all weights; four, or 8 bits, lose millimetres
 
 
@@ -25,7 +26,8 @@ def write_open_bodies(path: Path, shapes: dict[str, tuple[Template, Tensor]]) ->
 
     Args:
         path: the npz to write.
-        shapes: name to bind template and its ``zero_from_bind (J, 4, 4)``.
+        shapes: name to bind template and its ``zero_from_bind (J, 4, 4)``; the first one's UV atlas is everyone's.
+            A vertex's first UV coordinate must have the vertex's own number, so that ``uv_faces`` packs to little.
     """
     templates = [template for template, _ in shapes.values()]
     ids, values = sparse_weights(templates[0].weights.numpy(), KEPT_WEIGHTS)
@@ -38,6 +40,9 @@ def write_open_bodies(path: Path, shapes: dict[str, tuple[Template, Tensor]]) ->
         "weight_joints": np.where(values > 0, ids, 0).astype(np.uint8),
         "weight_values": np.rint(values * 65535).astype(np.uint16),
     }
+    if templates[0].uv is not None:
+        arrays["uv"] = np.rint(templates[0].uv.numpy() * UV_STEPS).astype(np.uint16)
+        arrays["uv_seams"] = (templates[0].uv_faces - templates[0].faces).numpy().astype(np.uint16)
     write_arrays(path, arrays)
 
 
@@ -65,24 +70,28 @@ def open_body(shape: str = "female", canonical_pose: Tensor | None = None) -> Bo
             "faces": "int F 3",
             "weight_joints": "int V K",
             "weight_values": "int V K",
-        }
+        },
+        {"uv": "int U 2", "uv_seams": "int F 3"},
     )
     weights = dense_weights(arrays["weight_joints"], arrays["weight_values"], len(SMPL_JOINTS))
+    faces = torch.from_numpy(arrays["faces"].astype(np.int64))
     bind = Template(
         vertices=torch.from_numpy(arrays["vertices"][which].mean(axis=0)),
-        faces=torch.from_numpy(arrays["faces"].astype(np.int64)),
+        faces=faces,
         weights=torch.from_numpy(weights),
         joints=torch.from_numpy(arrays["joints"][which].mean(axis=0)),
         parents=SMPL_PARENTS,
         joint_names=tuple(SMPL_JOINTS),
+        uv=torch.from_numpy(arrays["uv"] / np.float32(UV_STEPS)) if "uv" in arrays else None,
+        uv_faces=faces + torch.from_numpy(arrays["uv_seams"].astype(np.int64)) if "uv_seams" in arrays else None,
     )
     if shape == MEAN_SHAPE:
         return BodyModel(bind, t_pose_from_bind(bind), canonical_pose)
     return BodyModel(bind, torch.from_numpy(arrays["zero_from_bind"][which[0]]), canonical_pose)
 
 
-def _asset(keys: dict[str, str]) -> dict[str, np.ndarray]:
+def _asset(keys: dict[str, str], optional: dict[str, str] | None = None) -> dict[str, np.ndarray]:
     """Arrays of the asset."""
     if not ASSET.is_file():
         raise DataError(ASSET, "the open body's asset is missing.", "Reinstall, or run tools/export_body.py.")
-    return read_arrays(ASSET, keys)
+    return read_arrays(ASSET, keys, optional)

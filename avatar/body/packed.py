@@ -22,6 +22,8 @@ OPTIONAL_KEYS = {
     "weight_values": "number V K",
     "joints": "float J 3",
     "canonical_from_bind": "float J 4 4",
+    "uv": "float U 2",
+    "uv_faces": "int F 3",
     **BIND_KEYS,
 }
 
@@ -124,7 +126,8 @@ def packed_body(path: Path) -> BodyModel:
     The file holds ``vertices (V, 3)`` in the T-pose, ``faces (F, 3)``, ``parents (J,)``, ``joint_names (J,)``, the
     skinning weights as ``weights (V, J)`` or as ``weight_joints (V, K)`` and ``weight_values (V, K)``, and maybe
     ``joints (J, 3)``, which are estimated from the weights where they are missing. A body whose weights were painted
-    in another pose has ``bind_vertices``, ``bind_joints`` and ``zero_from_bind (J, 4, 4)`` as well.
+    in another pose has ``bind_vertices``, ``bind_joints`` and ``zero_from_bind (J, 4, 4)`` as well. A UV atlas, which
+    POP and SCALE need, is ``uv (U, 2)`` in [0, 1] and ``uv_faces (F, 3)``.
 
     Raises:
         DataError: for a missing or damaged file, missing keys, or arrays that do not make a body.
@@ -145,8 +148,11 @@ def packed_body(path: Path) -> BodyModel:
 def _template_arrays(template: Template) -> dict[str, np.ndarray]:
     """A template as the arrays of its file."""
     ids, values = sparse_weights(template.weights.cpu().numpy())
-    bound = template.canonical_from_bind
-    return ({} if bound is None else {"canonical_from_bind": bound.cpu().numpy()}) | {
+    given = {name: getattr(template, name) for name in ("canonical_from_bind", "uv", "uv_faces")}
+    arrays = {name: value.cpu().numpy() for name, value in given.items() if value is not None}
+    if "uv_faces" in arrays:
+        arrays["uv_faces"] = arrays["uv_faces"].astype(np.int32)
+    return arrays | {
         "vertices": template.vertices.cpu().numpy(),
         "faces": template.faces.cpu().numpy().astype(np.int32),
         "weight_joints": ids,
@@ -168,6 +174,7 @@ def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.nd
         raise AvatarError("weights: expected `weights`, or `weight_joints` and `weight_values`, got neither.")
     if joints is None:
         joints = joint_positions(vertices, weights, parents)
+    atlas = {key: kind for key, kind in (("uv", np.float32), ("uv_faces", np.int64)) if key in arrays}
     return Template(
         vertices=torch.from_numpy(vertices.astype(np.float32)),
         faces=torch.from_numpy(arrays["faces"].astype(np.int64)),
@@ -175,4 +182,5 @@ def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.nd
         joints=torch.from_numpy(joints.astype(np.float32)),
         parents=parents,
         joint_names=tuple(str(name) for name in arrays["joint_names"]),
+        **{key: torch.from_numpy(arrays[key].astype(kind)) for key, kind in atlas.items()},
     )

@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from avatar.checks import AvatarError
+from avatar.geometry.surface import sample_surface
+from avatar.nn.baselines.pop import PopAvatar, PopConfig
+from avatar.nn.baselines.scale import ScaleAvatar, ScaleConfig
 from avatar.nn.closet import ClosetAvatar, ClosetConfig
-from avatar.records import Template
+from avatar.records import SurfaceSamples, Template
 
 
 @dataclass(frozen=True)
@@ -20,7 +24,11 @@ class Method:
     network: type[nn.Module]
 
 
-METHODS = {"closet": Method(ClosetConfig, ClosetAvatar)}
+METHODS = {
+    "closet": Method(ClosetConfig, ClosetAvatar),
+    "pop": Method(PopConfig, PopAvatar),
+    "scale": Method(ScaleConfig, ScaleAvatar),
+}
 
 
 def find_method(name: str) -> Method:
@@ -40,3 +48,16 @@ def build_avatar(name: str, template: Template, outfits: int, settings: Any) -> 
     if not isinstance(settings, method.settings):
         raise AvatarError(f"settings: expected {method.settings.__name__}, got {type(settings).__name__}.")
     return method.network(template, outfits, settings)
+
+
+def draw_samples(
+    model: nn.Module, vertices: Tensor, faces: Tensor, points: int, generator: torch.Generator
+) -> SurfaceSamples:
+    """Where on the body a network predicts: spread evenly by area, or at points of its own.
+
+    A network on UV maps has its grid's pixels or patches instead (``template_samples(points)``); their number is then
+    close to ``points``, not equal.
+    """
+    own = getattr(model, "template_samples", None)
+    samples = own(points) if own else None
+    return sample_surface(vertices, faces, points, generator) if samples is None else samples

@@ -20,6 +20,8 @@ class StandIn:
         self.bone_labels = [f"mixamorig:{name}" for name in (*MIXAMO_NAMES, FINGER)]
         self.bone_parents = [*([-1] + [0] * 21), MIXAMO_NAMES.index("LeftHand")]
         self.faces = torch.tensor([[0, 1, 2]])
+        self.texture_coordinates = torch.tensor([[0.0, 0], [1, 0], [0, 1], [1, 1]], dtype=torch.float64)
+        self.face_texture_coordinate_indices = torch.tensor([[3, 1, 2]], dtype=torch.int32)
         self.vertex_bone_indices = torch.arange(23)[:, None]
         self.vertex_bone_weights = torch.ones(23, 1, dtype=torch.float64)
         heads = torch.zeros(23, 3, dtype=torch.float64)
@@ -47,6 +49,7 @@ def test_template_is_y_up_with_fingers_in_the_hand(anny):
     assert template.weights.shape == (23, 22)
     assert template.weights[22, SMPL_JOINTS.index("left_wrist")] == 1
     assert template.weights[:22].argmax(dim=1).tolist() == list(range(22))
+    assert template.uv[template.uv_faces[0]].tolist() == [[1, 1], [1, 0], [0, 1]]
 
 
 def test_zero_pose_has_horizontal_arms(anny):

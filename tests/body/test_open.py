@@ -1,6 +1,7 @@
 """The open body: its joints, its shape, its zero pose, and the weights it keeps."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from bodies import random_pose
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.open import ASSET, MEAN_SHAPE, open_body, open_body_shapes, write_open_bodies
 from avatar.checks import AvatarError, DataError
+from avatar.geometry.neighbours import nearest
 from avatar.geometry.transforms import transform_points
+from avatar.geometry.uv import rasterise_uv
 from avatar.records import Template
 
 # SMPL's joint order as its papers and files have it, written out apart from the code
@@ -90,7 +93,7 @@ def test_posed_body_is_its_template_moved_by_its_transforms(body):
 
 
 def test_asset_is_small():
-    assert ASSET.stat().st_size < 400_000
+    assert ASSET.stat().st_size < 460_000
     assert set(open_body_shapes()) >= {"female", "male"}
 
 
@@ -109,6 +112,45 @@ def test_stored_weights_pose_like_the_full_ones(tmp_path, monkeypatch):
     torch.testing.assert_close(stored.bind_vertices, bind.vertices, atol=0, rtol=0)
     torch.testing.assert_close(stored.zero_from_bind, full.zero_from_bind, atol=0, rtol=0)
     assert torch.equal(stored.faces, full.faces)
+
+
+def test_atlas_is_whole_and_without_folds(body):
+    """Every triangle has its own place in the square, none is turned over, and together they fill 63% of it."""
+    template = body.template
+    assert template.uv.shape == (13343, 2) and template.uv.min() >= 0 and template.uv.max() <= 1
+    first, second, third = template.uv[template.uv_faces].double().unbind(dim=1)
+    doubled = torch.linalg.det(torch.stack([second - first, third - first], dim=-1))
+    assert doubled.min() > 0
+    assert float(doubled.sum() / 2) == pytest.approx(0.6277, abs=1e-4)
+    covered = len(rasterise_uv(template.uv, template.uv_faces, template.faces, 256).pixels) / 256**2
+    assert covered == pytest.approx(0.6277, abs=2e-3)  # less than the areas' sum if triangles overlapped
+    owner = torch.full((13343,), -1)
+    owner[template.uv_faces.ravel()] = template.faces.ravel()
+    assert torch.equal(owner[template.uv_faces], template.faces)  # a UV coordinate belongs to one vertex
+
+
+def test_chest_is_laid_out_left_right_symmetric(body):
+    """Mirrored points of the chest lie at places mirrored about u = 0.38: the coordinates sit on the right vertices."""
+    template = body.template
+    uv = template.uv[: len(template.vertices)]  # a vertex's first place has its own number
+    partner = nearest((template.vertices * torch.tensor([-1.0, 1, 1]))[None], template.vertices[None])[0]
+    chest = ((uv - torch.tensor([0.38, 0.65])).abs() < 0.12).all(dim=1)
+    assert chest.sum() > 500
+    assert (uv[partner] - (uv * torch.tensor([-1.0, 1]) + torch.tensor([0.76, 0])))[chest].abs().max() < 0.005
+
+
+def test_atlas_survives_another_canonical_pose_and_the_asset(tmp_path, monkeypatch):
+    full = open_body("female")
+    turned = full.with_canonical_pose(random_pose(22)).template
+    assert torch.equal(turned.uv, full.template.uv) and torch.equal(turned.uv_faces, full.template.uv_faces)
+    bind = replace(full.template, canonical_from_bind=None)
+    path = tmp_path / "bodies.npz"
+    write_open_bodies(path, {"only": (bind, full.zero_from_bind)})
+    monkeypatch.setattr("avatar.body.open.ASSET", path)
+    stored = open_body("only").template
+    assert torch.equal(stored.uv, bind.uv) and torch.equal(stored.uv_faces, bind.uv_faces)
+    write_open_bodies(path, {"only": (replace(bind, uv=None, uv_faces=None), full.zero_from_bind)})
+    assert open_body("only").template.uv is None
 
 
 def test_unknown_shape_and_missing_asset(monkeypatch, tmp_path):

@@ -54,7 +54,7 @@ def test_template_round_trip_loses_nothing_but_the_bind_pose(tmp_path):
     write_template(path, body.template)
     torch.testing.assert_close(read_template(path).canonical_from_bind, body.template.canonical_from_bind)
     for again in (read_template(path), packed_body(path).template):
-        for name in ("vertices", "faces", "joints", "weights"):
+        for name in ("vertices", "faces", "joints", "weights", "uv", "uv_faces"):
             torch.testing.assert_close(getattr(again, name), getattr(body.template, name), atol=1e-6, rtol=0)
         assert (again.parents, again.joint_names) == (body.parents, body.joint_names)
 
@@ -127,6 +127,8 @@ def test_joints_missing_from_the_file_are_estimated(tmp_path):
         ({"vertices": None}, "vertices"),
         ({"joint_names": np.array(["a", "b"])}, "joint_names"),
         ({"vertices": np.full((40, 3), np.nan)}, "finite"),
+        ({"uv": np.zeros((3, 2))}, "uv_faces: expected shape"),
+        ({"uv": np.zeros((3, 2)), "uv_faces": np.full((30, 3), 3)}, "uv_faces: expected indices"),
         ({"vertices": np.array([object()] * 40)}, "vertices"),
     ],
 )

@@ -1,0 +1,1 @@
+"""The papers' rivals, one file a method, written from their papers."""

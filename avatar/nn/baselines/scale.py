@@ -1,0 +1,193 @@
+"""SCALE (Surface Codec of Articulated Local Elements, CVPR 2021): the dressed body as small patches of points."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from avatar.checks import AvatarError, check_shape
+from avatar.geometry.neighbours import nearest
+from avatar.geometry.sampling import farthest_points
+from avatar.geometry.surface import interpolate
+from avatar.geometry.transforms import transform_directions
+from avatar.geometry.uv import uv_barycentric
+from avatar.nn.baselines.atlas import Atlas, uv_and_patch
+from avatar.nn.baselines.unet import UNet, UNetConfig
+from avatar.nn.decoders import DecoderConfig, ShapeDecoder
+from avatar.nn.pointnet2 import point_mlp
+from avatar.records import Batch, Prediction, SurfaceSamples, Template
+
+PLACE_CHANNELS = 4  # UV coordinates of the patch, and a point's own in the patch
+
+
+class PoseFeature(Enum):
+    """What a patch knows of the pose."""
+
+    local = "local"  # its pixel of the feature map
+    whole = "global"  # one vector for the whole body: the variant in CloSET's table 4
+
+
+@dataclass
+class PointNetConfig:
+    """Channels of the PointNet behind the global variant; the defaults are the classification network's."""
+
+    points: tuple[int, ...] = (64, 64, 64, 128, 1024)  # shared by all points, before the maximum
+    body: tuple[int, ...] = (512, 256)  # after it
+
+    def __post_init__(self):
+        self.points, self.body = tuple(self.points), tuple(self.body)
+        if not self.points or min(self.points + self.body) < 1:
+            raise AvatarError(f"points, body: expected positive channel counts, got {self.points}, {self.body}.")
+
+
+@dataclass
+class ScaleConfig:
+    """SCALE's switches and sizes; the defaults are the paper's."""
+
+    pose_encoder: UNetConfig = field(default_factory=lambda: UNetConfig(levels=5, affine=True))
+    global_encoder: PointNetConfig = field(default_factory=PointNetConfig)  # with pose_feature=global only
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    map_size: int = 32  # pixels a side of the position map; each pixel in the atlas can be a patch
+    patches: int = 798  # at most; all pixels of the atlas where there are fewer
+    pose_feature: PoseFeature = PoseFeature.local
+
+    def __post_init__(self):
+        if self.patches < 1:
+            raise AvatarError(f"patches: expected at least 1, got {self.patches}.")
+        if self.map_size < 1 or self.map_size % 2**self.pose_encoder.levels:
+            raise AvatarError(
+                f"map_size: expected a multiple of {2**self.pose_encoder.levels}, as pose_encoder.levels="
+                f"{self.pose_encoder.levels} halvings need, got {self.map_size}."
+            )
+
+
+class PointNet(nn.Module):
+    """One feature vector for a whole point cloud: a shared network, the maximum over points, a network behind it."""
+
+    def __init__(self, out_channels: int, config: PointNetConfig):
+        super().__init__()
+        self.points = point_mlp((3, *config.points))
+        layers, fan_in = [], config.points[-1]
+        for width in config.body:  # no normalisation here: a batch of one body has nothing to normalise over
+            layers += [nn.Linear(fan_in, width), nn.ReLU()]
+            fan_in = width
+        self.body = nn.Sequential(*layers, nn.Linear(fan_in, out_channels))
+
+    def forward(self, points: Tensor) -> Tensor:
+        """``(B, N, 3)`` to ``(B, C)``."""
+        return self.body(self.points(points).amax(dim=1))
+
+
+class ScaleAvatar(nn.Module):
+    """The SCALE network of one outfit: patches that ride on triangles of the posed body and take their shape from it.
+
+    A patch belongs to a pixel of the position map. It has that pixel's feature, a place on the body and the frame of
+    the triangle there, and its points are told apart by patch coordinates alone: the cell of the pixel a point stands
+    for. A point of the body that lies in no patch's pixel is taken to belong to the patch nearest in the atlas.
+    """
+
+    def __init__(self, template: Template, outfits: int, config: ScaleConfig):
+        """Builds the network on a body template with UV coordinates.
+
+        Raises:
+            AvatarError: for more than one outfit, which SCALE has no code for.
+        """
+        super().__init__()
+        if outfits != 1:
+            raise AvatarError(f"outfit: SCALE models one outfit, got {outfits}; train a run for each.")
+        self.config, self.vertex_count = config, len(template.vertices)
+        self.atlas = Atlas(template, config.map_size)
+        grid = self.atlas.grid
+        places = interpolate(template.vertices, grid.samples)
+        chosen = farthest_points(places, min(config.patches, len(places))).sort().values
+        corners = torch.stack([grid.pixels[chosen] % config.map_size, grid.pixels[chosen] // config.map_size], dim=-1)
+        rows, columns = torch.meshgrid(*[torch.arange(config.map_size)] * 2, indexing="ij")
+        pixels = torch.stack([columns, rows, torch.zeros_like(rows)], dim=-1).flatten(0, 1).float()
+        owner = nearest(pixels[None], torch.nn.functional.pad(corners, (0, 1))[None].float().cpu())[0]
+        for name, value in {
+            "patch_pixels": grid.pixels[chosen],
+            "patch_corners": corners,
+            "patch_vertex_ids": grid.samples.vertex_ids[chosen],
+            "patch_barycentric": grid.samples.barycentric[chosen],
+            "patch_face_ids": grid.samples.face_ids[chosen],
+            "patch_of_pixel": owner,
+        }.items():
+            self.register_buffer(name, value.clone(), persistent=False)
+        channels = config.pose_encoder.out_channels
+        if config.pose_feature is PoseFeature.local:
+            self.pose_encoder = UNet(3, config.pose_encoder)
+        else:
+            self.pose_encoder = PointNet(channels, config.global_encoder)
+        self.decoder = ShapeDecoder(channels + PLACE_CHANNELS, config.decoder)
+
+    @property
+    def patches(self) -> SurfaceSamples:
+        """Where the patches ride on the body."""
+        return SurfaceSamples(self.patch_vertex_ids, self.patch_barycentric, self.patch_face_ids)
+
+    def template_samples(self, points: int) -> SurfaceSamples:
+        """The points this network predicts when about ``points`` are asked for: k x k cells of every patch's pixel.
+
+        A cell off the patch's triangle lies in the plane of it, so its barycentric coordinates may be negative.
+        """
+        side = max(1, round(math.sqrt(points / len(self.patch_pixels))))
+        steps = (torch.arange(side, device=self.patch_corners.device, dtype=torch.float64) + 0.5) / side
+        cells = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).flatten(0, 1)
+        uv = (self.patch_corners[:, None] + cells).flatten(0, 1) / self.config.map_size
+        face_ids = self.patch_face_ids.repeat_interleave(side**2)
+        barycentric = uv_barycentric(uv, self.atlas.uv[self.atlas.uv_faces[face_ids]].double())
+        vertex_ids = self.patch_vertex_ids.repeat_interleave(side**2, dim=0)
+        return SurfaceSamples(vertex_ids, barycentric.to(self.patch_barycentric.dtype), face_ids)
+
+    def pose_features(self, pose_vertices: Tensor) -> Tensor:
+        """What each patch knows of the pose: ``(B, V, 3)`` posed body to ``(B, P, C)``."""
+        if self.config.pose_feature is PoseFeature.local:
+            features = self.pose_encoder(self.atlas.position_map(pose_vertices)).flatten(2)
+            return features[..., self.patch_pixels].transpose(1, 2)
+        centres = interpolate(pose_vertices, self.patches)
+        return self.pose_encoder(centres)[:, None].expand(-1, centres.shape[1], -1)
+
+    def patch_frames(self, vertices: Tensor) -> Tensor:
+        """Frames of the patches' posed triangles: two edges, and the normal as long as edges are on average.
+
+        ``(B, V, 3)`` to ``(B, P, 3, 3)`` with the axes as columns; neither orthogonal nor of unit length.
+        """
+        first, second, third = (vertices[:, self.patch_vertex_ids[:, corner]] for corner in range(3))
+        edges = torch.stack([second - first, third - first], dim=-1)
+        length = edges.norm(dim=-2).mean(dim=(1, 2))[:, None, None]
+        normals = normalize(torch.linalg.cross(edges[..., 0], edges[..., 1], dim=-1), dim=-1, eps=1e-20)
+        return torch.cat([edges, (normals * length).unsqueeze(-1)], dim=-1)
+
+    def forward(self, batch: Batch, samples: SurfaceSamples) -> Prediction:
+        """Predicts the dressed surface of each frame at template points.
+
+        Args:
+            batch: posed bodies (its scans are not looked at).
+            samples: N points, those of `template_samples` or any others on the body.
+
+        Returns:
+            `Prediction` with ``x = T r + p``, p a patch's place on the posed body and T its triangle's frame.
+            ``offsets`` are ``T r``: r counts in edges of a triangle, which the regulariser could not compare.
+        """
+        check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=self.vertex_count)
+        size = self.config.map_size
+        spots = self.atlas.place(samples) * size
+        pixels = spots.floor().long().clamp(0, size - 1)
+        patch = self.patch_of_pixel[pixels[:, 1] * size + pixels[:, 0]]
+        corners = self.patch_corners[patch]
+        place = uv_and_patch((corners + 0.5) / size, spots - corners, len(batch.vertices))
+        features = self.pose_features(batch.pose_vertices)[:, patch]
+        local = self.decoder(torch.cat([features.to(place.dtype), place], dim=-1))
+        with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
+            frames = self.patch_frames(batch.vertices)[:, patch]
+            offsets = transform_directions(frames, local.offsets.float())
+            return Prediction(
+                points=interpolate(batch.vertices, self.patches)[:, patch] + offsets,
+                normals=normalize(transform_directions(frames, local.normals.float()), dim=-1),
+                offsets=offsets,
+            )

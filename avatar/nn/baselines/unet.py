@@ -1,0 +1,83 @@
+"""The U-Net of POP and SCALE: from an image of surface positions to a feature image of the same size."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from avatar.checks import AvatarError, check_shape
+
+SMOOTH_LEVELS = 3  # the last ones upsample and convolve, for transposed convolutions leave checkerboards
+WIDEST = 8  # times the first level's channels
+
+
+@dataclass
+class UNetConfig:
+    """Sizes of a U-Net; the defaults are POP's pose encoder, 10,348,192 parameters."""
+
+    levels: int = 7  # halvings of the image
+    width: int = 32  # channels after the first halving; doubled by each, up to eight times
+    out_channels: int = 64
+    affine: bool = False  # whether normalisations learn a scale and a shift
+
+    def __post_init__(self):
+        if self.levels < SMOOTH_LEVELS or self.width < 1 or self.out_channels < 1:
+            raise AvatarError(
+                f"levels, width, out_channels: expected at least {SMOOTH_LEVELS}, 1 and 1, got {vars(self)}."
+            )
+
+
+class UNet(nn.Module):
+    """Strided convolutions down, the way back up with every level's image joined in (pix2pix, as POP sizes it)."""
+
+    def __init__(self, channels: int, config: UNetConfig):
+        """Builds the network for images of ``channels`` channels."""
+        super().__init__()
+        self.channels, self.config = channels, config
+        widths = [config.width * min(2**level, WIDEST) for level in range(config.levels)]
+        self.downs, self.ups = nn.ModuleList(), nn.ModuleList()
+        for level, (fan_in, fan_out) in enumerate(itertools.pairwise([channels, *widths])):
+            layers = [nn.LeakyReLU(0.2)] if level else []
+            layers.append(nn.Conv2d(fan_in, fan_out, 4, stride=2, padding=1, bias=False))
+            if 0 < level < config.levels - 1:
+                layers.append(nn.BatchNorm2d(fan_out, affine=config.affine))
+            self.downs.append(nn.Sequential(*layers))
+        fan_in = widths.pop()
+        for level, fan_out in enumerate([*reversed(widths), config.out_channels]):
+            last = level == config.levels - 1
+            norm = [] if last else [nn.BatchNorm2d(fan_out, affine=config.affine)]
+            self.ups.append(nn.Sequential(nn.ReLU(), *self._enlarge(level, fan_in, fan_out), *norm))
+            fan_in = 2 * fan_out
+
+    def _enlarge(self, level: int, fan_in: int, fan_out: int) -> list[nn.Module]:
+        """Layers that double the size of an image."""
+        if level < self.config.levels - SMOOTH_LEVELS:
+            return [nn.ConvTranspose2d(fan_in, fan_out, 4, stride=2, padding=1, bias=False)]
+        upsample = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
+        return [upsample, nn.Conv2d(fan_in, fan_out, 3, padding=1)]
+
+    def forward(self, image: Tensor) -> Tensor:
+        """``(B, C, H, W)`` to ``(B, C', H, W)``; height and width are multiples of ``2 ** levels``.
+
+        Raises:
+            AvatarError: for an image of another size.
+        """
+        dims = check_shape("image", image, "B C H W", C=self.channels)
+        if dims["H"] % 2**self.config.levels or dims["W"] % 2**self.config.levels:
+            raise AvatarError(
+                f"image: expected height and width in multiples of {2**self.config.levels}, as {self.config.levels} "
+                f"levels need, got {dims['H']} x {dims['W']}."
+            )
+        pyramid = []
+        for down in self.downs:
+            image = down(image)
+            pyramid.append(image)
+        image = pyramid.pop()
+        for up in self.ups:
+            image = up(image)
+            if pyramid:
+                image = torch.cat([image, pyramid.pop()], dim=1)
+        return image
