@@ -7,9 +7,12 @@ import torch
 import yaml
 
 from avatar.body.open import open_body
+from avatar.data.open_layout import OpenOutfit
+from avatar.geometry.neighbours import nearest
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.io.frames import OpenFrame, OpenGarment, write_manifest, write_open_frame, write_open_garment
+from avatar.records import CanonicalScan
 from avatar.simulate.angles import pose_from_angles
 from avatar.training.loop import Schedule, TrainConfig
 from avatar.training.losses import LossConfig
@@ -83,3 +86,12 @@ def quick_training(**options) -> TrainConfig:
     """Training that learns the tiny outfit in seconds."""
     defaults = {"batch": 2, "fresh_points": True, "lr": 5e-3, "code_lr": 1e-2, "schedule": Schedule.cosine}
     return TrainConfig(**(defaults | {"loss": LossConfig(offset=20, normal_start=0.3)} | options))
+
+
+def canonical_truth(outfit: OpenOutfit, split: str, name: str) -> CanonicalScan:
+    """A frame's scan where its points truly belong at rest, as the best canonicalizer would carry it."""
+    scan, template = outfit.load(split, name).scan, outfit.template
+    points = torch.from_numpy(scan.canonical)
+    ids = nearest(points[None], template.vertices[None])[0]
+    normals = vertex_normals(template.vertices, template.faces)[ids].numpy()
+    return CanonicalScan(scan.canonical, normals, template.weights[ids].numpy(), np.arange(len(points)))

@@ -14,28 +14,41 @@ from torch import Tensor
 
 from avatar.body.model import BodyModel
 from avatar.body.open import MEAN_SHAPE, open_body
+from avatar.body.packed import packed_body
 from avatar.body.registry import canonical_pose
-from avatar.checks import AvatarError, DataError, check_shape
+from avatar.checks import AvatarError, DataError
+from avatar.data.fusion import fuse_mesh
 from avatar.data.outfits import SurfaceOutfit, read_outfit_settings
+from avatar.data.patterns import paint
 from avatar.data.scanner import DressedSurface, ScanConfig, scan_mesh, scan_points
+from avatar.data.soundness import check_pose
 from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_garment
 from avatar.records import BodyFit, Frame, Scan, Template
 
 
 @dataclass(frozen=True)
 class OpenBody:
-    """The open body as ``outfit.yaml`` names it: ``shape`` of the asset, ``canonical`` pose ``t`` or ``apart``."""
+    """The wearer as ``outfit.yaml`` names it: a ``shape`` of the open body or a ``body.npz`` of the same topology
+    (``shape`` None), and the ``canonical`` pose ``t`` or ``apart``.
+    """
 
-    shape: str
+    shape: str | None
     canonical: str
 
     @classmethod
     def from_settings(cls, settings: dict[str, Any], path: Path) -> OpenBody:
-        """Reads ``body: {model: open, shape: female, canonical: t}``; raises `DataError` where it says otherwise."""
+        """Reads ``body: {model: open, shape: female, canonical: t}`` or ``{model: packed, canonical: t}``.
+
+        Raises:
+            DataError: where it says otherwise.
+        """
         body = settings.get("body", {})
-        if not isinstance(body, dict) or body.get("model") != "open" or not isinstance(body.get("shape"), str):
-            raise DataError(path / "outfit.yaml", f"body: expected {{model: open, shape, canonical}}, got {body}.")
-        return cls(body["shape"], str(body.get("canonical", "t")))
+        body = body if isinstance(body, dict) else {}
+        named = body.get("model") == "open" and isinstance(body.get("shape"), str)
+        if not named and body.get("model") != "packed":
+            expected = "{model: open, shape, canonical} or {model: packed, canonical} with a body.npz"
+            raise DataError(path / "outfit.yaml", f"body: expected {expected}, got {settings.get('body')}.")
+        return cls(body["shape"] if named else None, str(body.get("canonical", "t")))
 
 
 class OpenOutfit(SurfaceOutfit):
@@ -54,7 +67,13 @@ class OpenOutfit(SurfaceOutfit):
     @cached_property
     def body(self) -> BodyModel:
         """The wearer."""
-        return self._make_body(self._described.shape)
+        if self._described.shape is not None:
+            return self._make_body(self._described.shape)
+        path = self.path / "body.npz"
+        body = packed_body(path)
+        if not torch.equal(body.faces, self.mean_body.faces):
+            raise DataError(path, "faces: expected those of the open body.", "Make the body with tools/make_body.py.")
+        return body.with_canonical_pose(self.mean_body.canonical_pose)
 
     @cached_property
     def mean_body(self) -> BodyModel:
@@ -78,16 +97,22 @@ class OpenOutfit(SurfaceOutfit):
         stored = self._read_open_frame(path)
         body = self.fit_pose(stored.pose, stored.translation)
         surface = self._surface(stored, body.vertices)
-        return Frame(name, self.name, split, body, scan_points(surface, self.scanner, f"{self.name}/{name}"))
+        scan = fuse_mesh if self.scanner.mesh else scan_points
+        return Frame(name, self.name, split, body, scan(surface, self.scanner, f"{self.name}/{name}"))
 
     def resample(self, split: str, name: str, points: int, seed: int) -> Scan:
         """A fresh, perfect sampling of a frame's visible surface, independent of the scanner's noise and holes."""
-        config = ScanConfig(points=points, seed=seed)
+        config = ScanConfig(points=points, seed=seed, pattern=self.scanner.pattern)
         return scan_points(self.load_surface(split, name), config, f"{self.name}/{name}/again")
 
     def load_mesh(self, split: str, name: str) -> Scan:
-        """What can be seen of a frame as a mesh: a scan with faces, labels and canonical positions."""
-        return scan_mesh(self.load_surface(split, name))
+        """What can be seen of a frame as a perfect mesh: a scan with faces, labels and canonical positions."""
+        return paint(scan_mesh(self.load_surface(split, name)), self.scanner.pattern)
+
+    def load_body(self, split: str, name: str) -> BodyFit:
+        """The body under a frame, without its scan."""
+        stored = self._read_open_frame(self.frame_path(split, name))
+        return self.fit_pose(stored.pose, stored.translation)
 
     def load_surface(self, split: str, name: str) -> DressedSurface:
         """Body and cloth of a frame as one labelled mesh with its visible faces."""
@@ -112,7 +137,7 @@ class OpenOutfit(SurfaceOutfit):
     @torch.no_grad()
     def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
         """The wearer in any pose; what a pose encoder sees of it is in mean shape, with the root at rest."""
-        check_shape("pose", pose, "J 3", J=len(self.body.parents))
+        check_pose(pose, len(self.body.parents))
         translation = np.zeros(3, np.float32) if translation is None else np.asarray(translation, np.float32)
         pose = np.asarray(pose, np.float32)
         turned = torch.from_numpy(pose)[None]

@@ -13,12 +13,14 @@ import torch
 from avatar.body.model import BodyModel
 from avatar.body.packed import packed_body, write_template
 from avatar.body.skinning import blend_transforms
-from avatar.checks import DataError, check_shape, require
+from avatar.checks import AvatarError, DataError, check_shape, require
 from avatar.data.outfits import OUTFIT_FORMAT, SPLITS, Outfit
+from avatar.data.soundness import check_pose
 from avatar.geometry.transforms import invert_rigid, transform_points
 from avatar.io.frames import write_manifest
 from avatar.io.meshes import read_mesh
 from avatar.io.npz import read_arrays, write_arrays, write_whole
+from avatar.io.points import color_bytes, unit_colors
 from avatar.records import BodyFit, Frame, Scan, Template
 
 log = logging.getLogger(__name__)
@@ -28,12 +30,13 @@ OPTIONAL = {
     "body_verts": "float V 3",
     "vtransf": "float V 3 3 | V 4 4",
     "joint_transforms": "float J 4 4",
-    "pose": "float J 3",
+    "pose": "float ...",  # `check_pose` says what another shape is
     "translation": "float 3",
     "pose_vertices": "float V 3",
     "scan_faces": "int F 3",
     "scan_labels": "uint8 M",
     "scan_canonical": "float M 3",
+    "scan_colors": "number M 3",  # uint8, or floats in [0, 1]
 }
 
 
@@ -64,21 +67,23 @@ class PackedOutfit(Outfit):
             ("body_verts", count),
             ("vtransf", count),
             ("joint_transforms", joints),
-            ("pose", joints),
         ):
             if key in stored and len(stored[key]) != expected:
                 mend = "The frame belongs to another body than the template."
                 raise DataError(
                     path, f"{key}: expected {expected} rows as in the template, got {len(stored[key])}.", mend
                 )
+        if "pose" in stored:
+            _check_stored_pose(stored["pose"], joints, path)
         stored = {k: v.astype(np.float32) if v.dtype.kind == "f" else v for k, v in stored.items()}
-        normals = stored["scan_n"]
+        normals, colors = stored["scan_n"], stored.get("scan_colors")
         scan = Scan(
             points=stored["scan_pc"],
             normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12),
             faces=self._scan_faces(stored, path),
             labels=stored.get("scan_labels"),
             canonical=stored.get("scan_canonical"),
+            colors=None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu"),
         )
         return Frame(name, self.name, split, self._fit(stored, path), scan)
 
@@ -88,7 +93,7 @@ class PackedOutfit(Outfit):
         if self.body is None:
             problem = "posing needs skinning weights and joints, and there is only template.obj."
             raise DataError(self.path, problem, "Add a template.npz with tools/convert_body.py.")
-        check_shape("pose", pose, "J 3", J=len(self.body.parents))
+        check_pose(pose, len(self.body.parents))
         translation = np.zeros(3, np.float32) if translation is None else np.asarray(translation, np.float32)
         pose = np.asarray(pose, np.float32)
         posed = self.body(torch.from_numpy(pose)[None], torch.from_numpy(translation)[None])
@@ -204,6 +209,14 @@ def _through(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None)
     return exact
 
 
+def _check_stored_pose(pose: np.ndarray, joints: int, path: Path) -> None:
+    """Refuses a file's pose that is not axis-angle for the template's joints."""
+    try:
+        check_pose(pose, joints)
+    except AvatarError as error:
+        raise DataError(path, str(error)) from error
+
+
 def _template_of_mesh(path: Path) -> Template:
     """A body that is only a mesh: everything hangs on one root joint at the origin."""
     if not path.is_file():
@@ -235,6 +248,7 @@ def write_packed_frame(path: Path, frame: Frame) -> None:
         "scan_faces": scan.faces,
         "scan_labels": scan.labels,
         "scan_canonical": scan.canonical,
+        "scan_colors": None if scan.colors is None else color_bytes(scan.colors),
         "scan_name": np.array(frame.name),
     }
     write_arrays(path, {key: value for key, value in arrays.items() if value is not None})

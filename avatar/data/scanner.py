@@ -1,4 +1,7 @@
-"""The virtual scanner: dressed bodies to oriented points, as a scanner or a packed dataset would give them."""
+"""The virtual scanner: dressed bodies to oriented points, as a scanner or a packed dataset would give them.
+
+Raw scans as meshes are made in `fusion`.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avatar.checks import AvatarError
+from avatar.data.patterns import Pattern, paint
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.records import Scan
 
@@ -19,13 +23,16 @@ FACING = -0.3  # cosine between normals below which two surfaces look at each ot
 
 @dataclass
 class ScanConfig:
-    """What the scanner gives of each frame. The defaults are a perfect scanner; see `SCANNERS` for a real one."""
+    """What the scanner gives of each frame. The defaults are a perfect scanner; see `SCANNERS` for real ones."""
 
-    points: int = 40_000  # a frame, before holes are cut
+    points: int = 40_000  # a frame, before holes are cut; a mesh has the points its edges need
     noise: float = 0.0  # metres, standard deviation of each coordinate
     holes: int = 0  # patches a frame where nothing was seen
     hole_radius: float = 0.05  # metres
     merge: float = 0.0  # metres; surfaces facing each other closer than this run into one
+    mesh: bool = False  # a fused triangle mesh instead of a point cloud
+    edge: float = 0.012  # metres; longest edge of such a mesh
+    pattern: Pattern = Pattern.none  # what the garments are coloured with; none gives scans without colours
     seed: int = 0
 
     def __post_init__(self):
@@ -34,12 +41,16 @@ class ScanConfig:
         for name in ("noise", "hole_radius", "merge"):
             if not 0 <= getattr(self, name) <= 0.5:
                 raise AvatarError(f"{name}: expected 0 to 0.5 metres, got {getattr(self, name)}.")
+        if not 0.004 <= self.edge <= 0.5:
+            raise AvatarError(f"edge: expected 0.004 to 0.5 metres, got {self.edge}.")
 
 
-# perfect: nothing lost. raw: what a scanner's fused mesh has: holes, noise, touching parts run together.
+# perfect: nothing lost. raw: what a scanner's fused mesh has: holes, noise, touching parts run together; as points,
+# and as the mesh itself, in which triangles bridge what touched.
 SCANNERS = {
     "perfect": ScanConfig(),
     "raw": ScanConfig(noise=0.0015, holes=6, hole_radius=0.04, merge=0.012),
+    "raw_mesh": ScanConfig(noise=0.0015, holes=6, hole_radius=0.04, merge=0.012, mesh=True),
 }
 
 
@@ -66,7 +77,7 @@ def scan_points(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan
 
     Args:
         surface: the dressed body.
-        config: number of points, noise, holes, merging, seed.
+        config: number of points, noise, holes, merging, pattern, seed.
         frame: the frame's name, part of the random seed.
 
     Raises:
@@ -92,7 +103,9 @@ def scan_points(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan
     if config.noise:
         shaken = scan.points + config.noise * rng.standard_normal(scan.points.shape, np.float32)
         scan = replace(scan, points=shaken)
-    return cut_holes(scan, config.holes, config.hole_radius, rng) if config.holes else scan
+    if config.holes:
+        scan = keep_points(scan, outside_holes(scan.points, config.holes, config.hole_radius, rng))
+    return paint(scan, config.pattern)
 
 
 def scan_mesh(surface: DressedSurface) -> Scan:
@@ -120,17 +133,7 @@ def merge_contacts(scan: Scan, distance: float) -> Scan:
     A point whose nearest point on a surface facing it is closer than ``distance`` moves halfway to it, and its
     normal turns to the blend of both. Truth (labels and canonical positions) stays.
     """
-    reach = 64  # nearest points looked at; the facing surface is among them where the gap is narrow
-    tree = cKDTree(scan.points)
-    distances, ids = tree.query(scan.points, k=min(reach, len(scan.points)), distance_upper_bound=distance)
-    known = np.isfinite(distances)
-    ids = np.where(known, ids, 0)
-    across = scan.points[ids] - scan.points[:, None]
-    ahead = np.einsum("mkc,mc->mk", across, scan.normals) > 0.5 * np.where(known, distances, np.inf)
-    facing = np.einsum("mkc,mc->mk", scan.normals[ids], scan.normals) < FACING
-    met = known & ahead & facing
-    moving = np.flatnonzero(met.any(axis=1))
-    partner = ids[moving, met[moving].argmax(axis=1)]
+    moving, partner = facing_partners(scan.points, scan.normals, distance)
     points, normals = scan.points.copy(), scan.normals.copy()
     points[moving] = (scan.points[moving] + scan.points[partner]) / 2
     blended = scan.normals[moving] + scan.normals[partner]
@@ -139,17 +142,42 @@ def merge_contacts(scan: Scan, distance: float) -> Scan:
     return replace(scan, points=points, normals=normals)
 
 
-def cut_holes(scan: Scan, holes: int, radius: float, rng: np.random.Generator) -> Scan:
-    """Takes away every point within the radius of a few of the scan's points, drawn at random."""
-    centres = scan.points[rng.integers(len(scan.points), size=holes)]
-    distances, _ = cKDTree(centres).query(scan.points, distance_upper_bound=radius)
-    kept = ~np.isfinite(distances)
+def facing_partners(points: np.ndarray, normals: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points that look at another surface across a gap narrower than ``distance``, and whom they look at.
+
+    Returns:
+        Two index arrays ``(K,)``: the points, and for each the nearest point ahead of it that faces it.
+    """
+    reach = 64  # nearest points looked at; the facing surface is among them where the gap is narrow
+    tree = cKDTree(points)
+    distances, ids = tree.query(points, k=min(reach, len(points)), distance_upper_bound=distance)
+    known = np.isfinite(distances)
+    ids = np.where(known, ids, 0)
+    across = points[ids] - points[:, None]
+    ahead = np.einsum("mkc,mc->mk", across, normals) > 0.5 * np.where(known, distances, np.inf)
+    facing = np.einsum("mkc,mc->mk", normals[ids], normals) < FACING
+    met = known & ahead & facing
+    moving = np.flatnonzero(met.any(axis=1))
+    return moving, ids[moving, met[moving].argmax(axis=1)]
+
+
+def outside_holes(points: np.ndarray, holes: int, radius: float, rng: np.random.Generator) -> np.ndarray:
+    """Which points ``(M,)`` lie beyond the radius of a few of the points, drawn at random."""
+    centres = points[rng.integers(len(points), size=holes)]
+    kept = cKDTree(centres).query(points, distance_upper_bound=radius)[0] == np.inf
     if not kept.any():
         raise AvatarError(f"holes: expected some points to be left, {holes} holes of {radius} m took them all.")
-    return replace(
-        scan,
-        points=scan.points[kept],
-        normals=scan.normals[kept],
-        labels=scan.labels[kept],
-        canonical=scan.canonical[kept],
-    )
+    return kept
+
+
+def keep_points(scan: Scan, kept: np.ndarray) -> Scan:
+    """Some of a scan's points ``(M,)`` bool, in their order, with all that is known of them, and the faces over them.
+
+    A face goes with any of its corners.
+    """
+    names = ("points", "normals", "labels", "canonical", "colors")
+    values = {name: getattr(scan, name)[kept] for name in names if getattr(scan, name) is not None}
+    if scan.faces is not None:
+        renumbered = np.cumsum(kept) - 1
+        values["faces"] = renumbered[scan.faces[kept[scan.faces].all(axis=1)]]
+    return replace(scan, **values)

@@ -1,37 +1,64 @@
-"""Checks of a frame when it is loaded: units, overlap of scan and body, emptiness, so that bad data never trains."""
+"""Checks of bodies, poses and frames when they are loaded, so that bad data never trains.
+
+Units, axes, overlap of scan and body, normals, poses written another way. What is refused is refused with what was
+seen and the likely mend; these are the mistakes that users of the published codes report most.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from avatar.checks import DataError
-from avatar.records import Frame, Template
+from avatar.checks import AvatarError, DataError, check_finite
+from avatar.data.alignment import NEAR, Overlap, measure_overlap, suggest_mend
+from avatar.records import Frame, Scan, Template
 
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
-MOST_APART = 0.25  # metres between scan and body, median; a wide skirt stays below half of it
 FEWEST_POINTS = 100
-CHECKED_POINTS = 500
+FAR_OFF = 10.0  # metres between the middles of scan and body that only a translation in other units explains
+# A sound frame covers 94% and more of the body, long dresses and raw scans included, and buries nothing.
+LEAST_COVERED, MOST_BURIED = 0.6, 0.05  # each alone is a misfit
+DOUBTFUL_COVERED, DOUBTFUL_BURIED, DOUBTFUL_OUTWARD = 0.85, 0.01, 0.8  # the first with one of the others
+INSIDE_OUT, UNORIENTED = 0.25, 0.7  # shares of normals that point outward
+ALONG = 0.7  # cosine to an axis from which on a direction runs along it
+MOST_TURN = 2 * np.pi + 0.1  # radians; no joint turns farther, and degrees soon exceed it
+AXES = (  # two joints, where the second lies from the first
+    ("pelvis", "neck", "+y"),
+    ("right_hip", "left_hip", "+x"),
+)
+TURNS = {  # where it should lie and where it does: what mends it
+    ("+y", "-y"): "Turn body and scans by 180 degrees about z: (x, y, z) to (-x, -y, z).",
+    ("+y", "+z"): "Turn body and scans by -90 degrees about x: (x, y, z) to (x, z, -y).",
+    ("+y", "-z"): "Turn body and scans by 90 degrees about x: (x, y, z) to (x, -z, y).",
+    ("+y", "+x"): "Turn body and scans by 90 degrees about z: (x, y, z) to (-y, x, z).",
+    ("+y", "-x"): "Turn body and scans by -90 degrees about z: (x, y, z) to (y, -x, z).",
+    ("+x", "-x"): "Either it faces -z (turn body and scans by 180 degrees about y), or it is mirrored (negate x).",
+    ("+x", "+z"): "Turn body and scans by 90 degrees about y: (x, y, z) to (z, y, -x).",
+    ("+x", "-z"): "Turn body and scans by -90 degrees about y: (x, y, z) to (-z, y, x).",
+}
 
 
 def check_template(template: Template, path: Path) -> None:
-    """Refuses a body at rest that is no person's height in metres.
+    """Refuses a body at rest that does not stand upright in metres, y up, facing +z.
 
     Raises:
-        DataError: with the factor that would mend centimetres or millimetres.
+        DataError: with the turn, or the factor, that would mend it.
     """
+    vertices = template.vertices.numpy()
+    extents = np.ptp(vertices, axis=0)
     low, high = BODY_HEIGHT
-    height = float(np.ptp(template.vertices.numpy()[:, 1]))
-    if not low <= height <= high:
-        problem = f"vertices: expected a body {low} to {high} m high, got {height:.4g} along y."
-        raise DataError(path, problem, _unit_hint(height))
+    if low <= extents.max() <= high:
+        _check_axes(template, path)
+    if not low <= extents[1] <= high:
+        problem = f"vertices: expected a body {low} to {high} m high, got {extents[1]:.4g} along y."
+        raise DataError(path, problem, _unit_hint(float(extents[1])))
 
 
 def check_frame(frame: Frame, template: Template, path: Path) -> None:
-    """Refuses a frame whose body or scan is empty, in other units, or not where the other is.
+    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out.
 
     Raises:
         DataError: naming the file, what was expected and how to mend it.
@@ -48,17 +75,127 @@ def check_frame(frame: Frame, template: Template, path: Path) -> None:
     if not low <= scan / posed <= high:
         problem = f"scan: expected about {posed:.2f} m across as the body, got {scan:.4g}."
         raise DataError(path, problem, _unit_hint(scan))
-    some = points[np.linspace(0, len(points) - 1, min(CHECKED_POINTS, len(points))).astype(int)]
-    apart = float(np.median(cKDTree(body).query(some)[0]))
-    if apart > MOST_APART:
-        shift = np.median(body, axis=0) - np.median(points, axis=0)
-        problem = f"scan: expected it over its body, half of its points are {apart:.2f} m and more away."
-        mend = f"Both must stand in one frame; their middles differ by ({', '.join(f'{s:.2f}' for s in shift)}) m."
-        raise DataError(path, problem, mend)
     lengths = np.linalg.norm(frame.scan.normals, axis=1)
     if (np.abs(lengths - 1) > 0.05).mean() > 0.01:
         problem = f"scan normals: expected unit length, got {lengths.min():.3g} to {lengths.max():.3g}."
         raise DataError(path, problem, "Normalise them, or compute them anew.")
+    faces = template.faces.numpy()
+    overlap = measure_overlap(points, frame.scan.normals, body, faces)
+    _check_overlap(overlap, frame.scan, body, faces, path)
+    _check_normals(overlap, frame.scan, path)
+
+
+def check_pose(pose: np.ndarray, joints: int) -> None:
+    """Refuses a pose that is not ``(J, 3)`` axis-angle in radians: matrices, quaternions, flat vectors, degrees.
+
+    Args:
+        pose: what came.
+        joints: J, of the body.
+
+    Raises:
+        AvatarError: with what it looks like and how to write it as expected.
+    """
+    shape = tuple(np.shape(pose))
+    if shape != (joints, 3):
+        problem = f"pose: expected shape ({joints}, 3), axis-angle in radians, got {shape}."
+        raise AvatarError(f"{problem} {_pose_hint(shape, joints)}".strip())
+    check_finite("pose", pose)
+    turns = np.linalg.norm(np.asarray(pose, np.float64), axis=1)
+    if turns.max() > MOST_TURN:
+        raise AvatarError(
+            f"pose: expected radians, joint {int(turns.argmax())} turns by {turns.max():.4g}, more than a full turn. "
+            "That looks like degrees: multiply by pi / 180."
+        )
+
+
+def check_frame_count(names: Sequence[str], path: Path, what: str, least: int = 2) -> None:
+    """Refuses fewer frames than something can be learned from.
+
+    Raises:
+        DataError: naming what needs more, and the frames there are.
+    """
+    if len(set(names)) < least:
+        there = f"{len(set(names))} ({', '.join(sorted(set(names)))})" if names else "none"
+        problem = f"{what} needs at least {least} frames in different poses, there is {there}."
+        raise DataError(path, problem, "What moves with which joint shows only between poses: add scans.")
+
+
+def _check_axes(template: Template, path: Path) -> None:
+    """Refuses a body whose joints, or whose shape where they are unknown, do not stand upright facing +z."""
+    places = dict(zip(template.joint_names, template.joints.numpy().astype(np.float64)))
+    for start, end, wanted in AXES:
+        if start in places and end in places and (found := _axis_along(places[end] - places[start])) != wanted:
+            problem = f"joints: expected {end} towards {wanted} from {start}, it lies towards {found or 'no axis'}."
+            mend = TURNS.get((wanted, found), "Turn body and scans so that y is up and the body faces +z.")
+            raise DataError(path, problem, mend)
+    _, height, depth = np.ptp(template.vertices.numpy(), axis=0)
+    if height < depth / 2:
+        problem = f"vertices: expected a body that stands along y, it is {height:.2f} m high and {depth:.2f} m deep."
+        raise DataError(path, problem, TURNS["+y", "+z"])
+
+
+def _axis_along(direction: np.ndarray) -> str:
+    """The axis a direction runs along, as ``+y``; empty where it is along none."""
+    unit = direction / max(float(np.linalg.norm(direction)), 1e-12)
+    axis = int(np.abs(unit).argmax())
+    return f"{'+' if unit[axis] > 0 else '-'}{'xyz'[axis]}" if abs(unit[axis]) > ALONG else ""
+
+
+def _check_overlap(overlap: Overlap, scan: Scan, body: np.ndarray, faces: np.ndarray, path: Path) -> None:
+    """Refuses a scan that does not lie over its body, with the move or turn that would lay it there."""
+    inside_out = overlap.outward < INSIDE_OUT
+    doubtful = overlap.covered < DOUBTFUL_COVERED and (
+        overlap.buried > DOUBTFUL_BURIED or (overlap.outward < DOUBTFUL_OUTWARD and not inside_out)
+    )
+    if not (overlap.covered < LEAST_COVERED or overlap.buried > MOST_BURIED or doubtful):
+        return
+    problem = (
+        f"scan: expected it over its body, {overlap.covered:.0%} of the body has a scan point within "
+        f"{NEAR:.2f} m and {overlap.buried:.0%} of the scan lies deep inside."
+    )
+    shift = np.median(body, axis=0) - np.median(scan.points, axis=0)
+    if np.abs(shift).max() > FAR_OFF:
+        mend = f"Their middles differ by ({', '.join(f'{s:.1f}' for s in shift)}) m: is the translation in metres?"
+    else:
+        mend = suggest_mend(scan.points, scan.normals, body, faces)
+    raise DataError(path, problem, mend)
+
+
+def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> None:
+    """Refuses normals that point inward, or either way, and faces that are wound against them."""
+    if overlap.outward < INSIDE_OUT:
+        problem = f"scan normals: expected them to point outward, {1 - overlap.outward:.0%} point into the body."
+        raise DataError(path, problem, "The scan is inside out: multiply its normals by -1.")
+    if overlap.outward < UNORIENTED:
+        problem = f"scan normals: expected them to point outward, only {overlap.outward:.0%} do."
+        raise DataError(path, problem, "Orient them (MeshLab, Open3D), or compute them from the mesh.")
+    if scan.faces is None or not len(scan.faces):
+        return
+    some = scan.faces[:: max(1, len(scan.faces) // 1000)]
+    a, b, c = (scan.points[some[:, corner]] for corner in range(3))
+    agree = float(((np.cross(b - a, c - a) * scan.normals[some[:, 0]]).sum(axis=1) > 0).mean())
+    if agree < 0.5:
+        problem = f"scan faces: expected them counter-clockwise from outside, {1 - agree:.0%} are not."
+        raise DataError(path, problem, "Swap two columns of the faces.")
+
+
+def _pose_hint(shape: tuple[int, ...], joints: int) -> str:
+    """What a pose of another shape looks like, and how to write it as axis-angle."""
+    if shape[-2:] == (3, 3) and len(shape) == 3:
+        return "These are rotation matrices: scipy.spatial.transform.Rotation.from_matrix(pose).as_rotvec()."
+    if len(shape) == 2 and shape[1] == 4:
+        return "These are quaternions: scipy.spatial.transform.Rotation.from_quat(pose).as_rotvec(), x y z w."
+    if shape == (joints, 6):
+        return "These are 6D rotations: make matrices of them, then rotation vectors."
+    if shape in ((joints * 3,), (1, joints * 3)):
+        return f"It is flat: pose.reshape({joints}, 3)."
+    total = int(np.prod(shape)) if shape else 0
+    flat = len(shape) == 1 or shape[0] == 1
+    if total % 3 == 0 and total > joints * 3 and (flat or (len(shape) == 2 and shape[1] == 3)):
+        count = total // 3
+        first = f"pose.reshape({count}, 3)[:{joints}]" if flat else f"pose[:{joints}]"
+        return f"It has {count} joints; where the first {joints} are this body's, as for SMPL and SMPL-X: {first}."
+    return "One rotation vector a joint, relative to its parent."
 
 
 def _diagonal(points: np.ndarray) -> float:
@@ -70,5 +207,7 @@ def _unit_hint(size: float) -> str:
     """What to do about a person of a wrong size."""
     for factor, unit in ((100, "centimetres"), (1000, "millimetres")):
         if BODY_HEIGHT[0] <= size / factor <= 2 * BODY_HEIGHT[1]:
-            return f"That looks like {unit}: divide positions and translations by {factor}."
+            return f"That looks like {unit}: divide positions and translations by {factor} (multiply by {1 / factor})."
+    if BODY_HEIGHT[0] <= size * 1000 <= 2 * BODY_HEIGHT[1]:
+        return "That looks like kilometres, or metres scaled twice: multiply positions and translations by 1000."
     return "Positions must be in metres with y up."

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import DataError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_finite, check_shape
 from avatar.io.npz import write_whole
 from avatar.records import PointCloud
 
@@ -19,6 +19,7 @@ MAX_HEADER = 1 << 16
 EXACT_LENGTH = 1e-5  # normals closer to unit length than this are kept bit for bit
 LENGTH_TOLERANCE = 1e-2  # and closer than this are renormalised
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz")
+COLORS = ("red", "green", "blue")
 SCALARS = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -42,12 +43,13 @@ class PlyHeader:
 
 
 def write_points(path: str | Path, cloud: PointCloud) -> None:
-    """Writes a cloud as binary little-endian PLY, float32 ``x y z nx ny nz``, metres.
+    """Writes a cloud as binary little-endian PLY, float32 ``x y z nx ny nz``, metres, and uchar ``red green blue``.
 
-    Equal clouds give equal bytes. The file appears whole or not at all.
+    Colours are written where the cloud has them, 8 bits a channel. Equal clouds give equal bytes. The file appears
+    whole or not at all.
 
     Raises:
-        AvatarError: on wrong shapes, no points or non-finite values.
+        AvatarError: on wrong shapes, no points, non-finite values or colours beyond [0, 1].
         DataError: when the file name does not end in .ply.
     """
     path = Path(path)
@@ -58,20 +60,46 @@ def write_points(path: str | Path, cloud: PointCloud) -> None:
     check_finite("points, normals", values)
     if not len(values):
         raise DataError(path, "expected at least one point to write, got an empty cloud.")
+    columns, rows = [f"property float {name}" for name in COLUMNS], values.view("u1")
+    if cloud.colors is not None:
+        check_shape("colors", cloud.colors, "N 3", **dims)
+        columns += [f"property uchar {name}" for name in COLORS]
+        rows = np.concatenate([rows, color_bytes(cloud.colors)], axis=1)
     lines = ["ply", "format binary_little_endian 1.0", "comment metres, y up", f"element vertex {len(values)}"]
-    lines += [*(f"property float {name}" for name in COLUMNS), "end_header", ""]
-    write_whole(path, "\n".join(lines).encode("ascii") + values.tobytes())
+    lines += [*columns, "end_header", ""]
+    write_whole(path, "\n".join(lines).encode("ascii") + rows.tobytes())
+
+
+def color_bytes(colors: np.ndarray) -> np.ndarray:
+    """Colours in [0, 1] as 8 bits a channel; raises `AvatarError` for values that are not in [0, 1]."""
+    colors = np.asarray(colors, np.float64)
+    if not ((colors >= 0) & (colors <= 1)).all():
+        raise AvatarError(f"colors: expected RGB in [0, 1], got {colors.min():.4g} to {colors.max():.4g}.")
+    return np.rint(colors * 255).astype(np.uint8)
+
+
+def unit_colors(path: Path, colors: np.ndarray, whole: bool) -> np.ndarray:
+    """A file's colours as float32 in [0, 1]: whole numbers are 0 to 255, floats are in [0, 1] already.
+
+    Raises:
+        DataError: for values beyond that range.
+    """
+    highest = 255 if whole else 1
+    if colors.size and not 0 <= colors.min() <= colors.max() <= highest:
+        problem = f"expected colours from 0 to {highest}, got {colors.min():.4g} to {colors.max():.4g}."
+        raise DataError(path, problem, "Store them as uint8.")
+    return (colors / highest).astype(np.float32)
 
 
 def read_points(path: str | Path) -> PointCloud:
-    """Reads an oriented point cloud from a PLY file: float32 points and unit normals, both ``(N, 3)``.
+    """Reads an oriented point cloud from a PLY file: float32 points, unit normals and, where it has them, colours.
 
     Foreign files are welcome: ASCII or binary, further properties and elements are ignored. Normals a little off
-    unit length are renormalised.
+    unit length are renormalised. Colours are ``red green blue`` as uchar, or as floats in [0, 1].
 
     Raises:
         DataError: naming the file and what is wrong with it: missing, another format, damaged, empty, too large,
-            no normals, non-finite values or normals far from unit length.
+            no normals, non-finite values, normals far from unit length, or colours beyond their range.
     """
     path = Path(path)
     _check_suffix(path)
@@ -81,18 +109,21 @@ def read_points(path: str | Path) -> PointCloud:
         raise DataError(path, f"expected at most {MAX_BYTES} bytes, got {path.stat().st_size}.")
     data = path.read_bytes()
     header = read_ply_header(path, data)
-    values = _read_columns(path, data, header)
+    columns = _wanted_columns(path, header)
+    values = _read_columns(path, data, header, columns)
     if not np.isfinite(values).all():
         bad = int((~np.isfinite(values)).any(axis=1).sum())
         raise DataError(path, f"{bad} of {len(values)} points are NaN or infinite.", "Remove them and try again.")
-    points, normals = values[:, :3], values[:, 3:]
+    points, normals, colors = values[:, :3], values[:, 3:6], values[:, 6:]
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     off = np.abs(lengths - 1)
     if off.max() > LENGTH_TOLERANCE:
         worst = float(lengths[off.argmax(), 0])
         raise DataError(path, f"expected unit normals, got one of length {worst:.4g}.", "Normalise them first.")
     normals = np.where(off > EXACT_LENGTH, normals / lengths, normals)
-    return PointCloud(points.astype(np.float32), normals.astype(np.float32))
+    whole = dict(header.properties).get("red", "f4")[0] in "iu"
+    found = unit_colors(path, colors, whole) if len(columns) > len(COLUMNS) else None
+    return PointCloud(points.astype(np.float32), normals.astype(np.float32), found)
 
 
 def read_ply_header(path: Path, data: bytes) -> PlyHeader:
@@ -125,8 +156,8 @@ def read_ply_header(path: Path, data: bytes) -> PlyHeader:
     return PlyHeader(byte_order, count, tuple(properties), end.end())
 
 
-def _read_columns(path: Path, data: bytes, header: PlyHeader) -> np.ndarray:
-    """Positions and normals as ``(N, 6)`` float64."""
+def _wanted_columns(path: Path, header: PlyHeader) -> tuple[str, ...]:
+    """The properties to read: positions, normals, and colours where all three are there."""
     names = [name for name, _ in header.properties]
     missing = [name for name in COLUMNS if name not in names]
     if missing:
@@ -135,16 +166,22 @@ def _read_columns(path: Path, data: bytes, header: PlyHeader) -> np.ndarray:
             f"expected the vertex properties {' '.join(COLUMNS)}, {' '.join(missing)} missing.",
             "Estimate oriented normals first (MeshLab: Compute normals for point sets).",
         )
+    return COLUMNS + COLORS if set(COLORS) <= set(names) else COLUMNS
+
+
+def _read_columns(path: Path, data: bytes, header: PlyHeader, columns: tuple[str, ...]) -> np.ndarray:
+    """Some properties as ``(N, C)`` float64."""
     if not header.count:
         raise DataError(path, "expected at least one point, got an empty cloud.")
     if not header.byte_order:
-        return _read_ascii(path, data, header, [names.index(name) for name in COLUMNS])
+        names = [name for name, _ in header.properties]
+        return _read_ascii(path, data, header, [names.index(name) for name in columns])
     row = np.dtype([(name, header.byte_order + code) for name, code in header.properties])
     if header.start + header.count * row.itemsize > len(data):
         held = (len(data) - header.start) // row.itemsize
         raise DataError(path, f"cut short: the header promises {header.count} vertices, the file holds {held}.")
     rows = np.frombuffer(data, row, header.count, header.start)
-    return np.stack([rows[name] for name in COLUMNS], axis=1).astype(np.float64)
+    return np.stack([rows[name].astype(np.float64) for name in columns], axis=1)
 
 
 def _read_ascii(path: Path, data: bytes, header: PlyHeader, columns: list[int]) -> np.ndarray:

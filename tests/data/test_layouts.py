@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from avatar.body.open import open_body
-from avatar.body.packed import write_template
+from avatar.body.packed import write_body, write_template
 from avatar.checks import AvatarError, DataError
 from avatar.data.layouts import find_outfit, open_outfit_folder
 from avatar.data.open_layout import OpenOutfit
@@ -126,6 +126,21 @@ def test_legs_apart_is_another_canonical_space(copy):
     np.testing.assert_allclose(apart.fit_pose(pose).vertices, straight.vertices, atol=1e-5)
 
 
+def test_a_wearer_may_come_from_a_file(copy, tiny_outfit):
+    """As tools/simulate.py shapes=[tall.npz] leaves it; a body of another topology is refused."""
+    text = (copy / "outfit.yaml").read_text()
+    (copy / "outfit.yaml").write_text(text.replace("model: open", "model: packed"))
+    write_body(copy / "body.npz", open_body("male"))
+    outfit = OpenOutfit(copy)
+    torch.testing.assert_close(outfit.template.vertices, open_body("male").template.vertices, atol=1e-6, rtol=0)
+    ours, theirs = outfit.load_body("train", "rise.00003"), tiny_outfit.load_body("train", "rise.00003")
+    np.testing.assert_allclose(ours.pose_vertices, theirs.pose_vertices, atol=1e-6)
+    cut = open_body("male").template
+    write_template(copy / "body.npz", dataclasses.replace(cut, faces=cut.faces[:-1], uv=None, uv_faces=None))
+    with pytest.raises(DataError, match="make_body"):
+        OpenOutfit(copy).load_body("train", "rise.00003")
+
+
 def test_packing_loses_nothing(tiny_outfit, packed_folder):
     packed = open_outfit_folder(packed_folder)
     check_manifest(packed_folder, verify_hashes=True)
@@ -219,7 +234,13 @@ def test_pop_files_with_a_mesh_template_are_read_as_they_are(packed):
         ({"scan_pc": lambda a: a * 100}, "scan: expected about .* looks like centimetres: divide .* by 100"),
         ({"scan_pc": lambda a: a * 1000}, "scan: .* looks like millimetres"),
         ({"body_verts": lambda a: a * 100}, "body: expected about .* looks like centimetres"),
-        ({"scan_pc": lambda a: a + [0, 3, 0]}, r"expected it over its body.*differ by \(.*, -2\.\d\d, "),
+        ({"scan_pc": lambda a: a + [0, 3, 0]}, r"expected it over its body.*Moving it by \(.*, -(2\.9|3\.0)\d, "),
+        ({"scan_pc": lambda a: a[:, [0, 2, 1]]}, "expected it over its body.*Swapping y and z of the scan"),
+        ({"scan_n": lambda a: -a}, "multiply its normals by -1"),
+        ({"pose": lambda a: np.tile(np.eye(3), (22, 1, 1))}, r"expected shape \(22, 3\).*These are rotation matrices"),
+        ({"pose": lambda a: np.zeros(72)}, r"It has 24 joints"),
+        ({"pose": lambda a: np.rad2deg(a)}, "looks like degrees"),
+        ({"scan_colors": lambda _: np.full((4000, 3), 200.0)}, r"colours from 0 to 1, got 200 to 200\. Store them as"),
         ({"scan_pc": lambda a: a[:0], "scan_n": lambda a: a[:0]}, "at least 100 points, got 0"),
         ({"scan_pc": lambda a: a * np.nan}, "scan_pc: expected finite"),
         ({"scan_n": lambda a: a[:-1]}, r"scan_n: expected shape \(M, 3\) with M=4000"),
@@ -336,3 +357,29 @@ def test_a_mesh_scan_is_packed_with_its_faces(tiny_outfit, packed):
     read = PackedOutfit(folder).load("train", "rise.00003").scan
     np.testing.assert_array_equal(read.faces, meshed.scan.faces)
     np.testing.assert_allclose(read.points, meshed.scan.points, atol=1e-6)
+
+
+def test_colours_are_packed_to_8_bits_and_read_as_bytes_or_floats(tiny_outfit, packed):
+    folder, stored = packed
+    assert PackedOutfit(folder).load("train", "rise.00003").scan.colors is None
+    colors = np.random.default_rng(0).random((4000, 3), np.float32)
+    frame = tiny_outfit.load("train", "rise.00003")
+    colored = dataclasses.replace(frame, scan=dataclasses.replace(frame.scan, colors=colors))
+    write_packed_frame(folder / "train" / "rise.00003.npz", colored)
+    read = PackedOutfit(folder).load("train", "rise.00003").scan.colors
+    assert read.dtype == np.float32
+    np.testing.assert_allclose(read, colors, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_array_equal(reload(folder, {**stored, "scan_colors": colors}).scan.colors, colors)
+
+
+def test_the_body_of_a_frame_is_known_without_its_scan(tiny_outfit):
+    fit, known = tiny_outfit.load_body("train", "rise.00003"), tiny_outfit.load("train", "rise.00003").body
+    for key in FIT_KEYS:
+        np.testing.assert_array_equal(getattr(fit, key), getattr(known, key))
+
+
+def test_a_pose_to_fit_must_be_axis_angle(tiny_outfit):
+    with pytest.raises(AvatarError, match="These are rotation matrices"):
+        tiny_outfit.fit_pose(np.tile(np.eye(3, dtype=np.float32), (22, 1, 1)))
+    with pytest.raises(AvatarError, match=r"It is flat: pose\.reshape\(22, 3\)"):
+        tiny_outfit.fit_pose(np.zeros(66, np.float32))

@@ -1,12 +1,23 @@
 """The virtual scanner: even sampling, correct side, truth beside the points, and the flaws of the raw preset."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 
 from avatar.checks import AvatarError
-from avatar.data.scanner import SCANNERS, DressedSurface, ScanConfig, frame_seed, merge_contacts, scan_mesh, scan_points
+from avatar.data.scanner import (
+    SCANNERS,
+    DressedSurface,
+    ScanConfig,
+    frame_seed,
+    keep_points,
+    merge_contacts,
+    scan_mesh,
+    scan_points,
+)
 from avatar.records import Scan
 
 
@@ -131,9 +142,22 @@ def test_the_mesh_has_the_visible_faces_and_no_other_vertices(ball):
     np.testing.assert_allclose(np.linalg.norm(scan.normals, axis=1), 1, atol=1e-5)
 
 
+def test_kept_points_take_all_that_is_known_and_their_faces_along():
+    points = np.arange(15.0).reshape(5, 3)
+    faces = np.array([[0, 1, 2], [2, 3, 4], [0, 3, 4]])
+    whole = Scan(points, -points, faces, np.arange(5), points + 1, points / 20)
+    some = keep_points(whole, np.array([True, False, True, True, True]))
+    np.testing.assert_array_equal(some.points[some.faces], points[faces[1:]])
+    np.testing.assert_array_equal(some.labels, [0, 2, 3, 4])
+    np.testing.assert_array_equal(some.canonical, some.points + 1)
+    np.testing.assert_array_equal(some.colors, some.points / 20)
+    assert keep_points(Scan(points, -points), np.ones(5, bool)).faces is None
+
+
 def test_presets_and_ranges():
     assert SCANNERS["perfect"] == ScanConfig()
     assert SCANNERS["raw"].noise == 0.0015
-    for bad in ({"points": 0}, {"noise": -1}, {"noise": 2.0}, {"holes": -1}, {"merge": float("nan")}):
+    assert replace(SCANNERS["raw_mesh"], mesh=False) == SCANNERS["raw"]
+    for bad in ({"points": 0}, {"edge": 0.0}, {"noise": -1}, {"noise": 2.0}, {"holes": -1}, {"merge": float("nan")}):
         with pytest.raises(AvatarError, match="expected"):
             ScanConfig(**bad)

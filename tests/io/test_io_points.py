@@ -1,6 +1,7 @@
 """Point clouds on disk: exact round trips, foreign files, and every kind of bad file."""
 
 import hashlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,6 +79,44 @@ def test_normals_a_little_off_are_renormalised(tmp_path):
     back = read_points(tmp_path / "a.ply")
     np.testing.assert_allclose(np.linalg.norm(back.normals, axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(back.normals, cloud.normals, atol=1e-6)
+
+
+def test_colours_are_kept_to_8_bits(tmp_path):
+    cloud = random_cloud()
+    colors = np.random.default_rng(1).random((500, 3)).astype(np.float32)
+    write_points(tmp_path / "a.ply", replace(cloud, colors=colors))
+    back = read_points(tmp_path / "a.ply")
+    assert back.colors.dtype == np.float32
+    np.testing.assert_allclose(back.colors, colors, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_array_equal(back.points, cloud.points)
+    np.testing.assert_array_equal(back.normals, cloud.normals)
+    loaded = trimesh.load(tmp_path / "a.ply", process=False)
+    np.testing.assert_array_equal(loaded.visual.vertex_colors[:, :3], np.rint(colors * 255))
+    write_points(tmp_path / "b.ply", back)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    write_points(tmp_path / "c.ply", cloud)
+    assert read_points(tmp_path / "c.ply").colors is None
+
+
+def test_foreign_colours_are_bytes_or_unit_floats(tmp_path):
+    row = [0, 0, 0, 0, 0, 1]
+    floats = write_text(tmp_path / "a.ply", [[*row, 0.5, 0, 1]], "x y z nx ny nz red green blue")
+    np.testing.assert_allclose(read_points(floats).colors, [[0.5, 0, 1]])
+    whole = write_text(tmp_path / "b.ply", [[*row, 51, 0, 255]], "x y z nx ny nz red green blue")
+    with pytest.raises(DataError, match="expected colours from 0 to 1, got 0 to 255"):
+        read_points(whole)
+    for name in ("red", "green", "blue"):
+        whole.write_text(whole.read_text().replace(f"float {name}", f"uchar {name}"))
+    np.testing.assert_allclose(read_points(whole).colors, [[0.2, 0, 1]])
+    two = write_text(tmp_path / "c.ply", [[*row, 0.5, 0]], "x y z nx ny nz red green")
+    assert read_points(two).colors is None
+
+
+@pytest.mark.parametrize("colors", [np.full((3, 3), 255.0), np.full((3, 3), np.nan), np.zeros((2, 3))])
+def test_colours_that_are_none_are_not_written(tmp_path, colors):
+    with pytest.raises(AvatarError, match="colors: expected"):
+        write_points(tmp_path / "a.ply", replace(random_cloud(3), colors=colors))
+    assert not list(tmp_path.iterdir())
 
 
 def nan_row(path):

@@ -1,0 +1,314 @@
+"""Canonicalizations scored and tabled: errors of canonical points, and the metrics made of them.
+
+Metrics are named, have units and printed definitions as those of `metrics`, but compare a canonical scan with the
+truth of its frame (`canonical_truth`), not a prediction with a scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from avatar.checks import AvatarError, check_shape, require
+from avatar.evaluation.aggregate import method_key
+from avatar.evaluation.canonical_truth import (
+    APART,
+    CONTACT,
+    Canonicalized,
+    FrameTruth,
+    carry_truly,
+    frame_truth,
+    repose,
+)
+from avatar.evaluation.closest import closest_on_mesh
+from avatar.evaluation.metrics import Metric
+from avatar.evaluation.scores import FrameScore, Score, Scores
+from avatar.evaluation.scoring import Label, Outfit
+from avatar.evaluation.tables import Table, TableRow
+from avatar.records import Frame, Mesh, Template
+
+TRUE = "true weights"
+SURFACE_POINTS = 2_000  # canonical points a frame whose distance to the true surface is measured
+
+
+class CanonicalComparison:
+    """What a metric sees of one canonicalized frame: errors of its kept points, in metres, float64.
+
+    ``surfaces`` are the true canonical surfaces, a mesh for each label; without them `off_surface` is not known.
+    """
+
+    def __init__(
+        self,
+        frame: Frame,
+        truth: FrameTruth,
+        result: Canonicalized,
+        template: Template,
+        surfaces: Mapping[int, Mesh] | None = None,
+    ):
+        """Checks that the canonical scan is one of the frame's.
+
+        Raises:
+            AvatarError: for wrong shapes, or indices into another scan.
+        """
+        scan, count = result.scan, len(frame.scan.points)
+        dims = check_shape("canonical points", scan.points, "N 3")
+        check_shape("source", scan.source, "N", **dims)
+        check_shape("weights", scan.weights, "N J", **dims, J=len(template.parents))
+        if not len(scan.source) or scan.source.min() < 0 or scan.source.max() >= count:
+            raise AvatarError(
+                f"source: expected indices below the scan's {count} points, got {len(scan.source)} up to "
+                f"{scan.source.max(initial=0)}. Score it against the scan it was made of (same scanner options)."
+            )
+        self.frame, self.truth, self.result, self.template = frame, truth, result, template
+        self.surfaces = surfaces or {}
+
+    @cached_property
+    def off_truth(self) -> np.ndarray:
+        """Distance of each canonical point to its true place, ``(N,)``."""
+        scan = self.result.scan
+        return np.linalg.norm(scan.points - self.truth.canonical[scan.source].astype(np.float64), axis=1)
+
+    @cached_property
+    def off_cycle(self) -> np.ndarray:
+        """Distance of each point to itself when carried back with the weights of where it is, ``(N,)``; else empty."""
+        scan, weights = self.result.scan, self.result.forward_weights
+        if weights is None:
+            return np.empty(0)
+        check_shape("forward_weights", weights, "N J", N=len(scan.points), J=len(self.template.parents))
+        back = repose(scan.points, weights, self.frame.body, self.template)
+        return np.linalg.norm(back - self.frame.scan.points[scan.source].astype(np.float64), axis=1)
+
+    @cached_property
+    def off_weights(self) -> np.ndarray:
+        """Share of each point's weights that lies on wrong joints, ``(N,)`` in [0, 1]."""
+        scan = self.result.scan
+        return np.abs(scan.weights - self.truth.weights[scan.source].astype(np.float64)).sum(axis=1) / 2
+
+    @cached_property
+    def off_surface(self) -> np.ndarray:
+        """Distance of some points to the surface at rest that they belong to, ``(N,)``, NaN for the others."""
+        scan = self.result.scan
+        found = np.full(len(scan.points), np.nan)
+        some = np.linspace(0, len(found) - 1, min(SURFACE_POINTS, len(found))).astype(np.int64)
+        labels = self.frame.scan.labels[scan.source[some]]
+        for label, mesh in self.surfaces.items():
+            mine = some[labels == label]
+            if len(mine):
+                hits = closest_on_mesh(scan.points[mine], mesh.vertices, mesh.faces, exact_within=0.01)
+                found[mine] = np.abs(hits.signed_distances)
+        return found
+
+    def part(self, name: str) -> np.ndarray:
+        """Which kept points ``(N,)`` are ``all``, on a ``garment`` or in ``contact``."""
+        chosen = {"all": np.ones_like(self.truth.garment), "garment": self.truth.garment, "contact": self.truth.contact}
+        return chosen[name][self.result.scan.source]
+
+    @property
+    def lost(self) -> float:
+        """Share of the scan's points that the canonical scan lacks."""
+        return 1 - len(self.result.scan.source) / len(self.frame.scan.points)
+
+    @property
+    def cut(self) -> float:
+        """Share of the scan's triangles that the canonical scan lacks; NaN for a scan of points."""
+        before, after = self.frame.scan.faces, self.result.scan.faces
+        return np.nan if before is None or after is None else 1 - len(after) / len(before)
+
+
+PARTS = {
+    "all": "all points",
+    "garment": "points on garments",
+    "contact": f"points where the scan touches itself: another point within {100 * CONTACT:g} cm that is more than "
+    f"{100 * APART:g} cm away at rest",
+}
+
+
+def _over(part: str, errors: str, reduce: Callable[[np.ndarray], float], scale: float) -> Callable:
+    """A measure: one of the comparison's errors, where it is known, over one part of the points; NaN without any."""
+
+    def measure(comparison: CanonicalComparison) -> float:
+        values = getattr(comparison, errors)
+        if not len(values):
+            return np.nan
+        values = values[comparison.part(part)]
+        values = values[np.isfinite(values)]
+        return scale * float(reduce(values)) if len(values) else np.nan
+
+    return measure
+
+
+def _part_metrics(part: str) -> list[Metric]:
+    """The metrics of one part of the points."""
+    end, whom = "" if part == "all" else f"_{part}", PARTS[part]
+    truth = f"distance of canonical points to their true places on the clothes and skin at rest, {whom}."
+    cycle = f"distance of points to themselves when reposed with the weights at their canonical places, {whom}."
+    rows = (
+        ("truth", "off_truth", "cm", f"Mean {truth}", np.mean),
+        ("truth_median", "off_truth", "cm", f"Median {truth}", np.median),
+        ("truth_p95", "off_truth", "cm", f"95th percentile of the {truth}", lambda values: np.quantile(values, 0.95)),
+        ("cycle", "off_cycle", "cm", f"Cycle error: mean {cycle}", np.mean),
+        (
+            "surface",
+            "off_surface",
+            "cm",
+            f"Mean distance to the true surface of the same label, {whom}.",
+            np.mean,
+        ),
+        (
+            "weights",
+            "off_weights",
+            "1",
+            f"Share of skinning weight on other than the true joints, {whom}.",
+            np.mean,
+        ),
+    )
+    return [
+        Metric(
+            f"{name}{end}" + ("_cm" if unit == "cm" else ""),
+            unit,
+            1 if unit == "cm" else 100,
+            "cm" if unit == "cm" else "%",
+            definition,
+            _over(part, errors, reduce, 100 if unit == "cm" else 1),
+        )
+        for name, errors, unit, definition, reduce in rows
+    ]
+
+
+CANONICAL_METRICS: dict[str, Metric] = {
+    metric.name: metric
+    for metric in (
+        *(metric for part in PARTS for metric in _part_metrics(part)),
+        Metric("points_lost", "1", 100, "%", "Share of scan points that were cut away.", lambda c: c.lost),
+        Metric("triangles_cut", "1", 100, "%", "Share of triangles that were cut as stretched.", lambda c: c.cut),
+        Metric(
+            "contact_share",
+            "1",
+            100,
+            "%",
+            "Share of scan points in contact, of the scan as it came.",
+            lambda c: c.truth.contact.mean(),
+        ),
+    )
+}
+
+
+def score_canonicalization(
+    outfit: Outfit, split: str, names: Sequence[str], methods: Mapping[Label, Callable[[Frame], Canonicalized]]
+) -> Scores:
+    """Every metric of every frame for several canonicalizations, and for the true weights beside them.
+
+    The truth of a frame is found once for all methods. Metrics that a frame does not have (no contact, no triangles)
+    are left out of the means.
+
+    Args:
+        outfit: simulated, with ``template``; `surface` needs its ``load_surface`` too.
+        split: train or test.
+        names: frames of the split.
+        methods: for each its label and what it makes of a frame as the outfit loads it.
+
+    Raises:
+        AvatarError: naming the frame, for data without truth or a canonical scan that is not the frame's.
+    """
+    if not methods or not names:
+        raise AvatarError(f"methods, names: expected at least one each, got {len(methods)} and {len(names)}.")
+    first = next(iter(methods))
+    labels = [Label(TRUE, table=first.table, commit=first.commit), *methods]
+    template = outfit.template
+    surfaces = canonical_surfaces(outfit, split, names[0])
+    frames: list[FrameScore] = []
+    counts: dict[Label, list[int]] = {label: [] for label in labels}
+    for name in require("tqdm").tqdm(names, desc=f"canonical scans of {outfit.name}", disable=None):
+        frame = outfit.load(split, name)
+        try:
+            truth = frame_truth(frame.scan, template)
+            for label in labels:
+                result = methods[label](frame) if label in methods else carry_truly(frame, truth, template)
+                comparison = CanonicalComparison(frame, truth, result, template, surfaces)
+                counts[label].append(len(result.scan.points))
+                frames += _frame_scores(comparison, outfit.name, label)
+        except AvatarError as error:
+            raise AvatarError(f"outfit {outfit.name}, frame {name}: {error}") from error
+    rows = [row for label in labels for row in _mean_rows(frames, label, round(float(np.mean(counts[label]))))]
+    return Scores(rows, frames)
+
+
+def canonical_surfaces(outfit: Outfit, split: str, name: str) -> dict[int, Mesh]:
+    """Skin and garments at rest by label, as any frame of a simulated outfit knows them; nothing for other outfits."""
+    load = getattr(outfit, "load_surface", None)
+    if load is None:
+        return {}
+    whole = load(split, name)
+    labels, faces = whole.labels.numpy(), whole.faces.numpy()
+    return {int(i): Mesh(whole.canonical.numpy(), faces[labels[faces[:, 0]] == i]) for i in np.unique(labels)}
+
+
+def _frame_scores(comparison: CanonicalComparison, outfit: str, label: Label) -> list[FrameScore]:
+    """The metrics that a frame has."""
+    values = {name: float(metric.measure(comparison)) for name, metric in CANONICAL_METRICS.items()}
+    name = comparison.frame.name
+    return [
+        FrameScore(outfit, label.method, label.variant, label.seed, name, metric, value)
+        for metric, value in values.items()
+        if np.isfinite(value)
+    ]
+
+
+def _mean_rows(frames: list[FrameScore], label: Label, points: int) -> list[Score]:
+    """Means over the frames that have each metric, for one method."""
+    mine = [f for f in frames if (f.method, f.variant, f.seed) == (label.method, label.variant, label.seed)]
+    rows = []
+    for name, metric in CANONICAL_METRICS.items():
+        values = [frame.value for frame in mine if frame.metric == name]
+        if values:
+            rows.append(
+                Score(
+                    table=label.table,
+                    outfit=mine[0].outfit,
+                    method=label.method,
+                    variant=label.variant,
+                    metric=name,
+                    value=float(np.mean(values)),
+                    unit=metric.unit,
+                    frames=len(values),
+                    seed=label.seed,
+                    steps=label.steps,
+                    seconds=label.seconds,
+                    points=points,
+                    commit=label.commit,
+                )
+            )
+    return rows
+
+
+def canonical_table(rows: Sequence[Score], outfit: str, metrics: Sequence[str] = tuple(CANONICAL_METRICS)) -> Table:
+    """Canonicalization metrics by methods for one outfit, true weights first, with every definition in the notes.
+
+    Raises:
+        AvatarError: for unknown metrics, or an outfit that nobody scored.
+    """
+    unknown = [name for name in metrics if name not in CANONICAL_METRICS]
+    mine = [row for row in rows if row.outfit == outfit and row.metric in metrics]
+    if unknown or not mine:
+        what = f"metrics: unknown {', '.join(unknown)}" if unknown else f"outfit: nobody scored {outfit!r}"
+        raise AvatarError(f"{what}; there are {', '.join(CANONICAL_METRICS)}.")
+    values = {(row.metric, method_key(row)): row.value for row in mine}
+    methods = sorted({method for _, method in values}, key=lambda method: (method != TRUE, method))
+    scored = [CANONICAL_METRICS[name] for name in metrics if any((name, method) in values for method in methods)]
+    body = tuple(
+        TableRow(
+            f"{m.name} ({m.shown_in})",
+            tuple(values[m.name, k] * m.scale if (m.name, k) in values else None for k in methods),
+        )
+        for m in scored
+    )
+    notes = (*(f"{m.name}: {m.definition}" for m in scored), TRUE_NOTE)
+    return Table(outfit, "metric", tuple(methods), body, notes)
+
+
+TRUE_NOTE = (
+    f"{TRUE}: every point carried by the weights of the body under its true place. What is left is the cloth's own "
+    "motion over the body. Means are over the points a method kept (see points_lost)."
+)

@@ -1,0 +1,321 @@
+"""Canonicalizations against the truth: closed forms on a bent bar, the tiny outfit, best skinning, tables."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from avatar.body.skinning import chain_transforms, skin_transforms
+from avatar.checks import AvatarError
+from avatar.data.open_layout import OpenOutfit
+from avatar.data.scanner import ScanConfig
+from avatar.evaluation.best_skinning import BestSkinning, fit_weights, project_to_simplex
+from avatar.evaluation.canonical_scores import (
+    CANONICAL_METRICS,
+    TRUE,
+    CanonicalComparison,
+    canonical_surfaces,
+    canonical_table,
+    score_canonicalization,
+)
+from avatar.evaluation.canonical_truth import (
+    Canonicalized,
+    carry_truly,
+    carry_with,
+    contact_points,
+    frame_truth,
+    repose,
+    weights_under,
+)
+from avatar.evaluation.scores import read_scores, write_scores
+from avatar.evaluation.scoring import Label
+from avatar.evaluation.tables import to_csv, to_markdown
+from avatar.geometry.transforms import transform_points
+from avatar.records import BodyFit, Frame, Mesh, Scan, Template
+
+JOINTS = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
+
+
+def bar(bind_turn=0.0):
+    """A bar of two bones along x, from 0 to 2, its second half bound with a bend."""
+    x = torch.linspace(0, 2, 41)
+    vertices = torch.stack([x, torch.zeros(41), torch.zeros(41)], dim=1)
+    second = ((x - 0.9) / 0.2).clamp(0, 1)
+    bend = torch.tensor([[[0.0, 0, 0], [0, 0, bind_turn]]])
+    return Template(
+        vertices=vertices,
+        faces=torch.tensor([[0, 1, 2]]),
+        weights=torch.stack([1 - second, second], dim=1),
+        joints=JOINTS,
+        parents=(-1, 0),
+        joint_names=("one", "two"),
+        canonical_from_bind=chain_transforms(bend, JOINTS, (-1, 0))[0] if bind_turn else None,
+    )
+
+
+def bent_frame(template, points, weights, labels=None, angle=1.0, extra=0.0):
+    """A scan of canonical points carried by weights to a pose in which the second bone is bent."""
+    joints = chain_transforms(torch.tensor([[[0.2, 0.1, 0.3], [0, 0, angle]]]), JOINTS, template.parents)
+    forth = skin_transforms(torch.as_tensor(weights), joints, template.canonical_from_bind)[0]
+    posed = transform_points(forth, torch.as_tensor(points)).numpy() + np.float32(extra)
+    fit = BodyFit(
+        vertices=posed,
+        vertex_transforms=np.zeros((1, 4, 4)),
+        joint_transforms=joints[0].numpy(),
+        pose_vertices=posed,
+        translation=np.zeros(3),
+    )
+    up = np.tile(np.float32([0, 1, 0]), (len(points), 1))
+    turned = torch.einsum("nij,nj->ni", torch.linalg.inv(forth[:, :3, :3]).transpose(1, 2), torch.from_numpy(up))
+    normals = torch.nn.functional.normalize(turned, dim=-1).numpy()
+    labels = np.ones(len(points), np.uint8) if labels is None else labels
+    return Frame("a.0", "bar", "train", fit, Scan(posed, normals, labels=labels, canonical=points))
+
+
+def bar_points():
+    points = bar().vertices.numpy() + np.float32([0, 0.05, 0])
+    return points[::2].copy()
+
+
+@pytest.mark.parametrize("bind_turn", [0.0, 0.7])
+def test_true_weights_find_the_true_places_of_what_only_the_bones_move(bind_turn):
+    template, points = bar(bind_turn), bar_points()
+    frame = bent_frame(template, points, weights_under(points, template))
+    truth = frame_truth(frame.scan, template)
+    result = carry_truly(frame, truth, template)
+    np.testing.assert_allclose(result.scan.points, points, atol=1e-5)
+    np.testing.assert_allclose(result.scan.normals, np.tile([0, 1, 0], (len(points), 1)), atol=1e-4)
+    back = repose(result.scan.points, result.forward_weights, frame.body, template)
+    np.testing.assert_allclose(back, frame.scan.points, atol=1e-5)
+    seen = CanonicalComparison(frame, truth, result, template)
+    for errors in (seen.off_truth, seen.off_cycle, seen.off_weights):
+        assert errors.shape == (len(points),)
+        assert errors.max() < 1e-5
+    assert seen.lost == 0
+    assert np.isnan(seen.cut)
+
+
+def test_errors_are_those_of_the_weights():
+    """All weight on the first bone: the second half stays bent, a chord off its place; and the cycle does not close."""
+    template, points = bar(), bar_points()
+    frame = bent_frame(template, points, weights_under(points, template), angle=1.0)
+    truth = frame_truth(frame.scan, template)
+    wrong = np.tile(np.float32([1, 0]), (len(points), 1))
+    result = Canonicalized(carry_with(wrong, frame, template), truth.weights)
+    seen = CanonicalComparison(frame, truth, result, template)
+    far = points[:, 0] > 1.1
+    arm = np.linalg.norm(points[far] - [1, 0, 0], axis=1)
+    np.testing.assert_allclose(seen.off_truth[far], 2 * np.sin(0.5) * arm, rtol=1e-4)
+    np.testing.assert_allclose(seen.off_truth[points[:, 0] < 0.9], 0, atol=1e-5)
+    np.testing.assert_allclose(seen.off_weights[far], 1)
+    np.testing.assert_allclose(seen.off_cycle[far], 2 * np.sin(0.5) * arm, rtol=1e-4)
+    values = {name: metric.measure(seen) for name, metric in CANONICAL_METRICS.items()}
+    assert values["truth_cm"] == pytest.approx(100 * seen.off_truth.mean())
+    assert values["truth_median_cm"] == pytest.approx(100 * np.median(seen.off_truth))
+    assert values["truth_p95_cm"] == pytest.approx(100 * np.quantile(seen.off_truth, 0.95))
+    assert values["cycle_cm"] == pytest.approx(100 * seen.off_cycle.mean())
+    assert values["weights"] == pytest.approx(seen.off_weights.mean())
+    assert np.isnan(values["truth_contact_cm"])  # nothing touches
+    assert np.isnan(values["surface_cm"])  # no surface is known
+
+
+def test_parts_losses_and_cuts_are_of_the_points_kept():
+    template, points = bar(), bar_points()
+    labels = (points[:, 0] > 1).astype(np.uint8)
+    frame = bent_frame(template, points, weights_under(points, template), labels)
+    faces = np.stack([np.arange(19), np.arange(1, 20), np.arange(2, 21)], axis=1)
+    frame = replace(frame, scan=replace(frame.scan, faces=faces))
+    truth = frame_truth(frame.scan, template)
+    whole = carry_truly(frame, truth, template)
+    kept = np.arange(5, 21)
+    moved = whole.scan.points[kept] + np.float32([0, 0.03, 0]) * (labels[kept] == 0)[:, None]
+    scan = replace(
+        whole.scan,
+        points=moved,
+        normals=whole.scan.normals[kept],
+        weights=whole.scan.weights[kept],
+        source=kept,
+        faces=faces[5:] - 5,
+    )
+    seen = CanonicalComparison(frame, truth, Canonicalized(scan), template)
+    values = {name: metric.measure(seen) for name, metric in CANONICAL_METRICS.items()}
+    assert values["points_lost"] == pytest.approx(5 / 21)
+    assert values["triangles_cut"] == pytest.approx(5 / 19)
+    assert values["truth_garment_cm"] == pytest.approx(0, abs=1e-3)
+    assert values["truth_cm"] == pytest.approx(3 * (labels[kept] == 0).mean(), abs=1e-3)
+    assert np.isnan(values["cycle_cm"])  # nothing is known of the forward field
+
+
+def test_distance_to_the_surface_needs_no_correspondence():
+    """Points that slid along their own surface are on it; points on another label's surface are not."""
+    template, points = bar(), bar_points()
+    frame = bent_frame(template, points, weights_under(points, template))
+    truth = frame_truth(frame.scan, template)
+    result = carry_truly(frame, truth, template)
+    slid = replace(result.scan, points=result.scan.points + np.float32([0.1, 0.02, 0]))
+    corners = np.array([[-1.0, 0.05, -1], [4, 0.05, -1], [4, 0.05, 1], [-1, 0.05, 1]])
+    plane = Mesh(corners, np.array([[0, 2, 1], [0, 3, 2]]))
+    seen = CanonicalComparison(frame, truth, Canonicalized(slid), template, {1: plane})
+    np.testing.assert_allclose(seen.off_surface, 0.02, atol=1e-6)
+    other = CanonicalComparison(frame, truth, Canonicalized(slid), template, {0: plane})
+    assert np.isnan(other.off_surface).all()
+
+
+def test_contact_is_near_now_and_far_at_rest():
+    rest = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.05, 0, 0], [1, 0, 0], [2, 0, 0]])
+    posed = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.0, 0.005, 0], [1, 0, 0], [1.03, 0, 0]])
+    np.testing.assert_array_equal(contact_points(posed, rest), [True, True, True, False, False])
+    rng = np.random.default_rng(0)
+    posed, rest = rng.random((300, 3)) * 0.15, rng.random((300, 3)) * 0.15
+    near = np.linalg.norm(posed[:, None] - posed, axis=-1) <= 0.02
+    far = np.linalg.norm(rest[:, None] - rest, axis=-1) > 0.10
+    np.testing.assert_array_equal(contact_points(posed, rest), (near & far).any(axis=1))
+
+
+def test_scans_of_another_frame_and_data_without_truth_are_refused():
+    template, points = bar(), bar_points()
+    frame = bent_frame(template, points, weights_under(points, template))
+    truth = frame_truth(frame.scan, template)
+    result = carry_truly(frame, truth, template)
+    other = replace(result.scan, source=result.scan.source + 1)
+    with pytest.raises(AvatarError, match=r"indices below the scan.s 21 points, got 21 up to 21\..*same scanner"):
+        CanonicalComparison(frame, truth, Canonicalized(other), template)
+    with pytest.raises(AvatarError, match="only simulated data has the truth"):
+        frame_truth(replace(frame.scan, canonical=None), template)
+
+
+def test_the_simplex_projection_is_the_nearest_point():
+    values = torch.randn(20, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = project_to_simplex(values)
+    torch.testing.assert_close(found.sum(dim=1), torch.ones(20, dtype=torch.float64))
+    assert (found >= 0).all()
+    corners = torch.eye(5, dtype=torch.float64)
+    # nearest: no corner of the simplex lies farther along the way that is left to go (obtuse angles, exactly)
+    left = values - found
+    along = left @ corners.T - (left * found).sum(dim=1, keepdim=True)
+    assert along.max() < 1e-12
+    torch.testing.assert_close(project_to_simplex(found), found)
+
+
+@pytest.mark.parametrize("bind_turn", [0.0, 0.7])
+def test_fitted_weights_are_those_that_made_the_motion(bind_turn):
+    template = bar(bind_turn)
+    rest = template.vertices + torch.tensor([0, 0.1, 0.05])
+    share = torch.linspace(0, 1, 41)
+    made = torch.stack([1 - share, share], dim=1)
+    poses = 0.7 * torch.randn(6, 2, 3, generator=torch.Generator().manual_seed(0))
+    joints = chain_transforms(poses, JOINTS, template.parents)
+    forth = skin_transforms(made.expand(6, -1, -1), joints, template.canonical_from_bind)
+    found = fit_weights(rest, transform_points(forth, rest), joints, template.weights, template.canonical_from_bind)
+    tolerance = 0.02 if bind_turn else 5e-3  # bind positions are found in turn with the weights
+    torch.testing.assert_close(found.float(), made, atol=tolerance, rtol=0)
+
+
+def test_no_weights_leave_less_than_the_fitted_ones():
+    """Where the motion is not of the bones alone, in squares over points and frames, as posed."""
+    template, generator = bar(), torch.Generator().manual_seed(0)
+    rest = template.vertices + torch.tensor([0, 0.1, 0.05])
+    joints = chain_transforms(0.7 * torch.randn(6, 2, 3, generator=generator), JOINTS, template.parents)
+    posed = transform_points(skin_transforms(template.weights.expand(6, -1, -1), joints), rest)
+    posed = posed + 0.05 * torch.randn(posed.shape, generator=generator)
+
+    def left(weights):
+        return (transform_points(skin_transforms(weights.expand(6, -1, -1), joints), rest) - posed).square().sum((0, 2))
+
+    found = fit_weights(rest, posed, joints, template.weights).float()
+    shares = torch.linspace(0, 1, 201)
+    best = torch.stack([left(torch.tensor([[1 - share, share]]).expand(41, 2)) for share in shares]).amin(dim=0)
+    assert (left(found) <= best + 1e-4).all()
+    assert left(found).sum() < 0.97 * left(template.weights).sum()
+
+
+@pytest.fixture(scope="module")
+def scored(tiny_folder):
+    outfit = OpenOutfit(tiny_folder, "open", ScanConfig(points=1200))
+    names = outfit.frames("train")[::2]
+    best = BestSkinning(outfit, "train", outfit.frames("train"))
+
+    def lifted(frame):
+        result = carry_truly(frame, frame_truth(frame.scan, outfit.template), outfit.template)
+        return replace(result, scan=replace(result.scan, points=result.scan.points + np.float32([0, 0.1, 0])))
+
+    label = Label("lifted", table="t1", variant="x", seed=3, steps=7, commit="abc")
+    methods = {label: lifted, Label("best fixed weights", table="t1"): best}
+    return score_canonicalization(outfit, "train", names, methods), names
+
+
+def test_an_outfit_is_scored_with_the_references_beside(scored):
+    scores, names = scored
+    means = {(row.method, row.metric): row for row in scores.rows}
+    row = means["lifted", "truth_cm"]
+    assert (row.table, row.outfit, row.variant, row.seed, row.steps, row.commit) == ("t1", "tiny", "x", 3, 7, "abc")
+    assert (row.frames, row.points, row.unit) == (3, 1200, "cm")
+    singles = [f.value for f in scores.frames if (f.method, f.metric) == ("lifted", "truth_cm")]
+    assert [f.frame for f in scores.frames if (f.method, f.metric) == ("lifted", "truth_cm")] == list(names)
+    assert row.value == pytest.approx(np.mean(singles))
+    true, best = (means[method, "truth_garment_cm"].value for method in (TRUE, "best fixed weights"))
+    assert 0.4 < true < 3  # the bulge of up to 5 cm, over all of the tunic
+    assert 0.1 < best < 1
+    assert row.value == pytest.approx(10, abs=1.5)
+    assert means[TRUE, "weights"].value == 0
+    assert means["lifted", "surface_cm"].value > means[TRUE, "surface_cm"].value + 1
+    assert (TRUE, "triangles_cut") not in means  # scans of points
+
+
+def test_scores_are_kept_and_tabled(scored, tmp_path):
+    scores, _ = scored
+    write_scores(tmp_path / "scores.csv", scores)
+    assert read_scores(tmp_path / "scores.csv") == scores
+    table = canonical_table(scores.rows, "tiny", ["truth_cm", "weights"])
+    assert table.columns == (TRUE, "best fixed weights", "lifted (x)")
+    text = to_markdown(table)
+    assert "| truth_cm (cm) |" in text
+    assert "Mean distance of canonical points to their true places" in text
+    assert to_csv(table).count("\n") == 3
+    row = next(r for r in scores.rows if (r.method, r.metric) == ("lifted", "weights"))
+    assert table.rows[1].values[2] == pytest.approx(100 * row.value)
+    with pytest.raises(AvatarError, match="unknown speed"):
+        canonical_table(scores.rows, "tiny", ["speed"])
+    with pytest.raises(AvatarError, match="nobody scored 'skirt'"):
+        canonical_table(scores.rows, "skirt")
+
+
+def test_every_label_has_its_own_surface_at_rest(tiny_outfit):
+    surfaces = canonical_surfaces(tiny_outfit, "train", "rise.00002")
+    whole = tiny_outfit.load_surface("train", "rise.00004")
+    assert set(surfaces) == {0, 1, 2}
+    assert sum(len(mesh.faces) for mesh in surfaces.values()) == len(whole.faces)
+    skin = surfaces[0]
+    np.testing.assert_array_equal(skin.faces, tiny_outfit.template.faces)
+    rest = skin.vertices[: len(tiny_outfit.template.vertices)]
+    np.testing.assert_allclose(rest, tiny_outfit.template.vertices.numpy(), atol=1e-6)
+    labels = whole.labels.numpy()
+    assert (labels[surfaces[2].faces[:, 0]] == 2).all()
+    assert canonical_surfaces(SimpleNamespace(), "train", "a.0") == {}
+
+
+def test_best_weights_are_found_at_places_of_the_same_label(tiny_outfit):
+    best = BestSkinning(tiny_outfit, "train", tiny_outfit.frames("train")[:2])
+    surface = tiny_outfit.load_surface("train", "rise.00000")
+    rest, labels = surface.canonical.numpy(), surface.labels.numpy()
+    some = np.arange(0, len(rest), 97)
+    np.testing.assert_allclose(best.weights_at(rest[some], labels[some]), best.weights[some], atol=1e-3)
+    np.testing.assert_array_equal(best.weights[labels == 0], tiny_outfit.template.weights.numpy())
+    under = best.weights_at(rest[labels == 1][::50], np.zeros(len(rest[labels == 1][::50]), np.uint8))
+    np.testing.assert_allclose(under.sum(axis=1), 1, atol=1e-5)
+    assert np.abs(under - best.weights[labels == 1][::50]).max() > 0.01  # of the skin below, not of the cloth
+
+
+def test_errors_name_the_frame(tiny_outfit):
+    def wrong(frame):
+        result = carry_truly(frame, frame_truth(frame.scan, tiny_outfit.template), tiny_outfit.template)
+        return replace(result, scan=replace(result.scan, source=result.scan.source + 9999))
+
+    with pytest.raises(AvatarError, match=r"outfit tiny, frame rise\.00001: source"):
+        score_canonicalization(tiny_outfit, "train", ["rise.00001"], {Label("wrong"): wrong})
+    with pytest.raises(AvatarError, match="expected at least one each"):
+        score_canonicalization(tiny_outfit, "train", [], {})
+    with pytest.raises(AvatarError, match="at least one frame to fit"):
+        BestSkinning(SimpleNamespace(), "train", [])
