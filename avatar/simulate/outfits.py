@@ -62,7 +62,7 @@ class OutfitConfig:
     """Garments worn together, the innermost first."""
 
     name: str
-    shape: str = "female"
+    shape: str = "female"  # of the open body, or a body file
     garments: list[GarmentConfig] = field(default_factory=list)
 
 

@@ -16,7 +16,9 @@ import yaml
 from tqdm import tqdm
 
 from avatar import __version__
+from avatar.body.model import BodyModel
 from avatar.body.open import open_body
+from avatar.body.packed import packed_body, write_body
 from avatar.checks import DataError
 from avatar.io.frames import OpenGarment, read_open_frame, read_open_garment, write_manifest, write_open_garment
 from avatar.records import Motion
@@ -47,8 +49,22 @@ def one_thread() -> Iterator[None]:
 
 
 def dress(outfit: OutfitConfig, travel: TravelConfig) -> DressedBody:
-    """An open body in an outfit."""
-    return DressedBody(open_body(outfit.shape), outfit, travel)
+    """A body in an outfit."""
+    return DressedBody(wearer(outfit.shape), outfit, travel)
+
+
+def wearer(shape: str) -> BodyModel:
+    """The open body in one of its shapes, or a body of its topology from a file of tools/make_body.py.
+
+    Raises:
+        DataError: for a damaged file or a body of another topology.
+    """
+    if not shape.endswith(".npz"):
+        return open_body(shape)
+    body = packed_body(Path(shape))
+    if not torch.equal(body.faces, open_body().faces):
+        raise DataError(Path(shape), "faces: expected those of the open body.", "Make it with tools/make_body.py.")
+    return body
 
 
 def write_outfit(dressed: DressedBody, folder: Path, gates: GateConfig) -> None:
@@ -67,11 +83,15 @@ def write_outfit(dressed: DressedBody, folder: Path, gates: GateConfig) -> None:
             return
     canonical = dressed.settle(np.zeros_like(dressed.start_pose)).cloth
     folder.mkdir(parents=True, exist_ok=True)
+    body = {"model": "open", "shape": outfit.shape, "canonical": "t"}
+    if outfit.shape.endswith(".npz"):
+        body = {"model": "packed", "canonical": "t"}
+        write_body(folder / "body.npz", dressed.body)
     names = tuple(garment.name for garment in outfit.garments)
     write_open_garment(folder / "garment.npz", OpenGarment(dressed.faces, canonical, dressed.labels, names))
     text = {
         "name": outfit.name,
-        "body": {"model": "open", "shape": outfit.shape, "canonical": "t"},
+        "body": body,
         "units": "metres",
         "up": "y",
         "licence": "CC0-1.0",

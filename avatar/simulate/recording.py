@@ -52,7 +52,7 @@ class SimulateConfig:
     preset: str = "quick"  # quick, sample, full, motion
     root: str = "data/open"  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>
     outfits: list[str] = field(default_factory=list)
-    shapes: list[str] = field(default_factory=list)  # body shapes each outfit is put on; empty is its usual one
+    shapes: list[str] = field(default_factory=list)  # who wears them: female, male, files of tools/make_body.py
     train: int | None = None  # settled frames of random poses
     test: int | None = None  # settled frames of authored sequences
     train_motions: list[str] = field(default_factory=list)  # names of authored sequences, AMASS npz or BVH files
@@ -70,7 +70,7 @@ class SimulateConfig:
     def __post_init__(self):
         check_names("preset", [self.preset], tuple(PRESETS))
         check_names("outfits", self.outfits, OUTFIT_NAMES)
-        check_names("shapes", self.shapes, open_body_shapes())
+        check_names("shapes", [s for s in self.shapes if not s.endswith(".npz")], open_body_shapes())
         for name in ("train", "test", "workers", "history"):
             if (getattr(self, name) or 0) < 0:
                 raise AvatarError(f"{name}: expected a number of at least 0, got {getattr(self, name)}.")
@@ -92,7 +92,7 @@ def dressed_outfits(config: SimulateConfig) -> list[tuple[str, OutfitConfig]]:
     for name in config.outfits or PRESETS[config.preset].outfits:
         usual = DEFAULT_SHAPES[name]
         for shape in config.shapes or [usual]:
-            asked.append((name if shape == usual else f"{name}_{shape}", outfit(name, shape)))
+            asked.append((name if shape == usual else f"{name}_{Path(shape).stem}", outfit(name, shape)))
     return asked
 
 

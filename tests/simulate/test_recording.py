@@ -1,5 +1,6 @@
 """Configuration, pose selection, gates and resuming, without the solver."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import torch
 
 from avatar.body.open import open_body
-from avatar.checks import AvatarError
+from avatar.body.packed import write_body, write_template
+from avatar.checks import AvatarError, DataError
 from avatar.io.frames import OpenFrame, read_open_frame, write_open_frame
 from avatar.records import Motion
 from avatar.simulate import gates as gates_module
@@ -15,7 +17,7 @@ from avatar.simulate.dressing import Rest, bind_pose, pose_path
 from avatar.simulate.gates import GateConfig, edge_stretch, frame_names, missed, record_frame
 from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.poses import NamedPose
-from avatar.simulate.production import is_sound
+from avatar.simulate.production import is_sound, wearer
 from avatar.simulate.recording import (
     PRESETS,
     SimulateConfig,
@@ -53,6 +55,18 @@ def test_presets_are_as_promised():
 def test_folders_tell_bodies_apart():
     both = dressed_outfits(SimulateConfig(outfits=["dress"], shapes=["female", "male"]))
     assert [(folder, clothes.shape) for folder, clothes in both] == [("dress", "female"), ("dress_male", "male")]
+    made = dressed_outfits(SimulateConfig(outfits=["dress"], shapes=["bodies/tall.npz"]))
+    assert [(folder, clothes.shape) for folder, clothes in made] == [("dress_tall", "bodies/tall.npz")]
+
+
+def test_bodies_from_files_are_of_the_open_topology(tmp_path):
+    write_body(tmp_path / "tall.npz", open_body("male"))
+    found = wearer(str(tmp_path / "tall.npz")).template
+    torch.testing.assert_close(found.vertices, open_body("male").template.vertices, atol=1e-6, rtol=0)
+    few = open_body("male").template
+    write_template(tmp_path / "cut.npz", replace(few, faces=few.faces[:-1], uv=None, uv_faces=None))
+    with pytest.raises(DataError, match="make_body"):
+        wearer(str(tmp_path / "cut.npz"))
 
 
 def test_settled_poses_follow_preset_and_overrides():
