@@ -1,7 +1,7 @@
 """Trains an avatar: python tools/train.py outfit=dress method=closet size=small"""
 
 from avatar.config import command
-from avatar.training.runs import train_run
+from avatar.pipeline.methods import train
 
 if __name__ == "__main__":
-    command("train", train_run)
+    command("train", train)

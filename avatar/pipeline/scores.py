@@ -16,10 +16,13 @@ from avatar.evaluation.floors import score_body_floor, score_sampling_floor
 from avatar.evaluation.scores import Scores, read_scores, write_scores
 from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
+from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.motions import read_motion
 from avatar.io.npz import write_whole
+from avatar.pipeline.methods import is_implicit, load_avatar
+from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
 from avatar.training.prediction import predict_frames, predict_motion
-from avatar.training.runs import TrainedAvatar, load_run
+from avatar.training.runs import TrainedAvatar
 
 
 @dataclass
@@ -31,6 +34,7 @@ class PredictConfig:
     motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
     fps: float = 30.0  # frames a second a motion is resampled to
     points: int = 50000  # 1,000 to 400,000
+    surface: ExtractionConfig = field(default_factory=ExtractionConfig)  # of an implicit avatar
     checkpoint: str = "last"  # or best, on the held-back frames
     data_root: Path | None = None  # where the data are now; where they were at training if null
     device: str = "auto"
@@ -57,6 +61,11 @@ def predictions_folder(run: Path, name: str, outfit: str) -> Path:
     return run / "predictions" / name / outfit
 
 
+def meshes_folder(run: Path, name: str, outfit: str) -> Path:
+    """Where a run's surfaces stand: ``<run>/meshes/<split or motion>/<outfit>``."""
+    return run / "meshes" / name / outfit
+
+
 def run_outfits(avatar: TrainedAvatar, data_root: Path | None) -> list[Outfit]:
     """The outfits a run was trained on, where they are now or where they were then."""
     return replace(avatar.config, data_root=data_root or avatar.config.data_root).outfits()
@@ -68,18 +77,28 @@ def predict(config: PredictConfig) -> list[Path]:
     Raises:
         AvatarError: when a motion is asked for and the body cannot be posed (packed data has no body model).
     """
-    avatar = load_run(config.run, config.checkpoint, config.device)
+    avatar = load_avatar(config.run, config.checkpoint, config.device)
     folders = []
     for outfit in run_outfits(avatar, config.data_root):
         if config.motion is None:
             folders.append(predictions_folder(config.run, config.split, outfit.name))
-            predict_frames(avatar, outfit, config.split, folders[-1], config.points)
+            if is_implicit(avatar):
+                meshes = meshes_folder(config.run, config.split, outfit.name)
+                options = {"points": config.points, "config": config.surface}
+                predict_implicit_frames(avatar, outfit, config.split, folders[-1], meshes, **options)
+            else:
+                predict_frames(avatar, outfit, config.split, folders[-1], config.points)
             continue
         if not isinstance(outfit, OpenOutfit):
             raise AvatarError(f"motion: {outfit.name} has no body model to pose; use split instead.")
         motion = read_motion(config.motion, config.fps)
         folders.append(predictions_folder(config.run, motion.name, outfit.name))
-        predict_motion(avatar, outfit, motion, folders[-1], config.points)
+        if is_implicit(avatar):
+            meshes = meshes_folder(config.run, motion.name, outfit.name)
+            options = {"points": config.points, "config": config.surface}
+            predict_implicit_motion(avatar, outfit, motion, folders[-1], meshes, **options)
+        else:
+            predict_motion(avatar, outfit, motion, folders[-1], config.points)
     return folders
 
 
@@ -105,7 +124,7 @@ def score_runs(config: EvaluateConfig) -> Scores:
     """Scores every outfit of every run, and the floors once an outfit."""
     scores, seen = Scores(), set()
     for run in config.runs:
-        avatar = load_run(run)
+        avatar = load_avatar(run)
         settings = avatar.config
         label = Label(
             settings.method.variant,

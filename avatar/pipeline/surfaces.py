@@ -14,8 +14,8 @@ from avatar.export.rigged import write_rigged_glb
 from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_motion
 from avatar.io.points import read_points
-from avatar.pipeline.scores import predictions_folder, run_outfits
-from avatar.training.runs import load_run
+from avatar.pipeline.methods import is_implicit, load_avatar
+from avatar.pipeline.scores import meshes_folder, predictions_folder, run_outfits
 
 
 @dataclass
@@ -47,12 +47,16 @@ def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
         AvatarError: after all frames, naming those that could not be meshed.
     """
     reports = {}
-    for name in load_run(config.run).config.outfit:
+    avatar = load_avatar(config.run)
+    for name in avatar.config.outfit:
         folder = predictions_folder(config.run, config.predictions, name)
         if not folder.is_dir():
             raise DataError(folder, "no predictions here.", "Run tools/predict.py first.")
         frames = spaced_frames(sorted(path.stem for path in folder.glob("*.ply")), config.frames)
-        target = config.run / "meshes" / config.predictions / name
+        target = meshes_folder(config.run, config.predictions, name)
+        if is_implicit(avatar):  # predicting has written its own surfaces
+            reports[target] = MeshingReport(skipped=tuple(frames))
+            continue
         reports[target] = mesh_folder(folder, target, config.formats, frames, config.poisson)
     failed = {frame: why for report in reports.values() for frame, why in report.failed.items()}
     if failed:
@@ -73,7 +77,7 @@ def export(config: ExportConfig) -> list[Path]:
 
     Meshes are there when the sequence was meshed, joint tracks when its motion file is given.
     """
-    avatar, written = load_run(config.run), []
+    avatar, written = load_avatar(config.run), []
     for outfit in run_outfits(avatar, config.data_root):
         folder = predictions_folder(config.run, config.predictions, outfit.name)
         paths = sorted(folder.glob("*.ply"))

@@ -1,0 +1,44 @@
+"""All methods behind one door: point avatars and SCANimate's implicit one are trained and loaded by a run's method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from avatar.checks import AvatarError
+from avatar.implicit.avatar import ImplicitAvatar
+from avatar.nn.methods import METHODS
+from avatar.training.implicit_runs import METHOD, ScanimateConfig, load_implicit, train_implicit
+from avatar.training.runs import RunConfig, TrainedAvatar, load_run, train_run
+
+SETTINGS = {name: method.settings for name, method in METHODS.items()} | {METHOD: ScanimateConfig}
+
+
+def find_settings(name: str) -> type:
+    """The settings class of a method by name.
+
+    Raises:
+        AvatarError: listing the methods there are.
+    """
+    if name not in SETTINGS:
+        raise AvatarError(f"method: expected one of {', '.join(SETTINGS)}, got {name!r}.")
+    return SETTINGS[name]
+
+
+def train(config: RunConfig) -> Path:
+    """Trains a run by its method, or goes on with it; gives the run's folder."""
+    find_settings(config.method.name)
+    return train_implicit(config) if config.method.name == METHOD else train_run(config)
+
+
+def load_avatar(folder: Path, checkpoint: str = "last", device: str = "auto") -> TrainedAvatar:
+    """The trained avatar of a run's folder, whatever its method; see `load_run`."""
+    path = folder / "config.yaml"
+    implicit = path.is_file() and yaml.safe_load(path.read_text())["method"]["name"] == METHOD
+    return (load_implicit if implicit else load_run)(folder, checkpoint, device)
+
+
+def is_implicit(avatar: TrainedAvatar) -> bool:
+    """Whether an avatar is a surface of its own, extracted and posed, instead of points."""
+    return isinstance(avatar.model, ImplicitAvatar)
