@@ -140,7 +140,11 @@ def test_foreign_predictions_are_scored_from_their_folder(job, capsys):
 def test_runs_are_compared_in_one_table_with_their_floors(job, tmp_path):
     config, summary = job
     settings = CompareConfig(
-        table="tiny", runs_root=config.runs_root, dataset=config.dataset, metrics=("cd_point",), out=tmp_path
+        table="tiny",
+        runs_root=config.runs_root,
+        dataset=(config.dataset, "elsewhere"),
+        metrics=("cd_point",),
+        out=tmp_path,
     )
     text = compare(settings).read_text()
     assert "excess" in text and all(method in text for method in ("sampling", "body", "static", "closet"))

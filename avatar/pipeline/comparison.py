@@ -19,7 +19,7 @@ class CompareConfig:
 
     table: str = "main"  # the name of the table's files
     runs_root: Path = Path("runs")
-    dataset: str = "sample"
+    dataset: tuple[str, ...] = ("sample",)  # one or several; outfits of one name in two would share a row
     name: str = "default"  # runs of this name
     methods: tuple[str, ...] = ("static", "closet")
     metrics: tuple[str, ...] = ("cd_point", "cd_pop", "normal_l1_mean", "penetration_share", "uniformity")
@@ -57,12 +57,13 @@ def compare(config: CompareConfig) -> Path:
 
 def scored_files(config: CompareConfig) -> Iterator[Path]:
     """The score files of the runs and of their outfits' floors."""
-    outfits: set[str] = set()
-    for method in config.methods:
-        for path in sorted((config.runs_root / method / config.dataset).glob(f"*/{config.name}/scores.csv")):
-            outfits |= set(path.parent.parent.name.split("+"))
-            yield path
-    for outfit in sorted(outfits):
-        path = config.runs_root / "floors" / config.dataset / outfit / "scores.csv"
-        if path.is_file():
-            yield path
+    for dataset in config.dataset:
+        outfits: set[str] = set()
+        for method in config.methods:
+            for path in sorted((config.runs_root / method / dataset).glob(f"*/{config.name}/scores.csv")):
+                outfits |= set(path.parent.parent.name.split("+"))
+                yield path
+        for outfit in sorted(outfits):
+            path = config.runs_root / "floors" / dataset / outfit / "scores.csv"
+            if path.is_file():
+                yield path

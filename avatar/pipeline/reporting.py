@@ -23,11 +23,12 @@ from avatar.export.pictures import (
 )
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
+from avatar.pipeline.methods import load_avatar
 from avatar.pipeline.scores import predictions_folder, read_all_scores, run_outfits
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.records import Frame, PointCloud
 from avatar.training.prediction import body_batch, garment_template_cloud, outfit_index, predict, template_samples
-from avatar.training.runs import TrainedAvatar, load_run
+from avatar.training.runs import TrainedAvatar
 
 MAX_ERROR = 0.05  # metres at the hot end of the error pictures
 
@@ -48,7 +49,7 @@ def report(config: ReportConfig) -> Path:
 
     What has not been predicted, meshed or scored is said to be missing on the page.
     """
-    avatar = load_run(config.run)
+    avatar = load_avatar(config.run)
     scores = gather_scores(config, avatar)
     rows: list[PictureRow] = []
     for outfit in run_outfits(avatar, config.data_root):
@@ -138,7 +139,7 @@ def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
 def posed_template(avatar: TrainedAvatar, outfit: str, frame: Frame) -> PointCloud:
     """The garment template alone, skinned to a frame's body."""
     batch = body_batch([frame.body], outfit_index(avatar, outfit), (frame.name,))
-    return predict(avatar.model, batch, template_samples(avatar.template, 50_000), wrinkles=False)
+    return predict(avatar.model, batch, template_samples(avatar, 50_000), wrinkles=False)
 
 
 def template_pictures(avatar: TrainedAvatar, outfit: Outfit) -> list[PictureRow]:

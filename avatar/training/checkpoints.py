@@ -1,11 +1,15 @@
-"""Checkpoints that are never half-written and never silently damaged: written whole, listed with their sha256."""
+"""Checkpoints that are never half-written and never silently damaged: written whole, known by their sha256."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
+import math
+import re
+import shutil
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,58 +23,115 @@ from avatar.io.npz import write_whole
 
 MANIFEST = "manifest.json"
 KEPT = 2
+NAME = re.compile(r"step-(\d{8,})\.([0-9a-f]{16})\.pt")  # the step, and the first digits of the file's sha256
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float | None = None) -> Path:
-    """Writes the resume state of a step, keeps the last two and forgets older ones.
+    """Writes the resume state of a step, keeps the last two and the best, and forgets older ones.
 
-    The file is on disk before the manifest names it, and the manifest is replaced whole, so a crash at any moment
-    leaves the previous checkpoint valid.
+    A file is on disk before the manifest names it, no file is ever written over, and the manifest is replaced whole:
+    a crash or a full disk at any moment leaves the checkpoints from before valid.
 
     Args:
-        folder: the run's ``checkpoints`` folder.
-        state: tensors and plain values only (it is read back with ``weights_only``).
+        folder: the run's ``checkpoints`` folder; one job at a time (`locks.lock_folder`).
+        state: nested dicts and lists of tensors and plain values (it is read back with ``weights_only``).
         step: optimiser steps done.
-        best: validation score; when it is the lowest so far the weights are also kept as ``best``.
+        best: validation score; the checkpoint with the lowest so far is kept as the best.
 
     Raises:
-        AvatarError: when the state holds a non-finite weight; nothing is written then.
+        AvatarError: when the state holds a number that is not finite; nothing is written then.
+        DataError: when the disk refuses, saying how much room was needed and what there is still.
     """
-    for name, value in state["model"].items():
+    for name, value in _tensors(state):
         if value.is_floating_point() and not torch.isfinite(value).all():
             raise AvatarError(f"{name}: expected finite weights at step {step}; this checkpoint was not written.")
-    folder.mkdir(parents=True, exist_ok=True)
+    best = best if best is not None and math.isfinite(best) else None
     buffer = io.BytesIO()
-    torch.save(state, buffer)
-    entries = read_manifest(folder)
-    newest = _write_entry(folder, f"step-{step:08d}.pt", buffer, step)
-    older = [entry for entry in entries.get("last", []) if entry["file"] != newest["file"]]
-    entries["last"] = older[-(KEPT - 1) :] + [newest]
-    if best is not None and best <= entries.get("best", {}).get("score", float("inf")):
-        entries["best"] = _write_entry(folder, "best.pt", buffer, step) | {"score": best}
-    write_whole(folder / MANIFEST, json.dumps(entries, indent=1).encode())
-    listed = {entry["file"] for entry in entries["last"]}
-    for path in folder.glob("step-*.pt"):
+    torch.save({**state, "score": best}, buffer)
+    data = buffer.getbuffer()
+    digest = hashlib.sha256(data).hexdigest()
+    entry = {"file": f"step-{step:08d}.{digest[:16]}.pt", "step": step, "score": best, "sha256": digest}
+    before = read_manifest(folder)
+    older = [past for past in before.get("last", []) if past["step"] < step]  # later ones were damaged
+    entries = {"last": older[-(KEPT - 1) :] + [entry]}
+    record = before.get("best")
+    improved = best is not None and best <= (record["score"] if record else math.inf)
+    if improved or record:
+        entries["best"] = entry if improved else record
+    try:
+        write_whole(folder / entry["file"], data)
+        write_whole(folder / MANIFEST, _seal(entries))
+    except OSError as error:
+        raise _not_written(folder, error, len(data), before) from error
+    listed = {kept["file"] for kept in (*entries["last"], entries.get("best", entry))}
+    for path in (*folder.glob("step-*.pt"), *folder.glob(".*.tmp-*")):
         if path.name not in listed:
             path.unlink()
-    return folder / entries["last"][-1]["file"]
+    return folder / entry["file"]
 
 
-def _write_entry(folder: Path, name: str, buffer: io.BytesIO, step: int) -> dict[str, Any]:
-    data = buffer.getvalue()
-    write_whole(folder / name, data)
-    return {"file": name, "step": step, "sha256": hashlib.sha256(data).hexdigest()}
+def _tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
+    """Every tensor in nested dicts and lists, with its name."""
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, (dict, list, tuple)):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _tensors(item, f"{name}.{key}" if name else str(key))
+
+
+def _not_written(folder: Path, error: OSError, needed: int, before: dict[str, Any]) -> DataError:
+    free = shutil.disk_usage(folder if folder.is_dir() else ".").free
+    kept = f"step {before['last'][-1]['step']}" if before.get("last") else "none"
+    return DataError(
+        folder,
+        f"could not write a checkpoint ({error.strerror}; {needed:,} bytes needed, {free:,} free). "
+        f"The last one written: {kept}.",
+        "Make room and give the same command again.",
+    )
+
+
+def _seal(entries: dict[str, Any]) -> bytes:
+    """A manifest with the sha256 of its own entries."""
+    return json.dumps({**entries, "sha256": _digest(entries)}, indent=1).encode()
+
+
+def _digest(entries: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The checkpoints a folder lists: ``last`` (oldest first) and ``best``; empty when there are none."""
+    """The checkpoints a folder lists: ``last`` (oldest first) and ``best``; empty when there are none.
+
+    A damaged manifest is made again from the checkpoints, with a warning: their names hold step and hash.
+    """
     path = folder / MANIFEST
-    if not path.is_file():
-        return {}
-    try:
-        return json.loads(path.read_bytes())
-    except ValueError as error:
-        raise DataError(path, f"expected JSON ({error}).", "Delete the run to start anew.") from error
+    if path.is_file():
+        text = path.read_bytes()
+        try:
+            entries = json.loads(text)
+            if entries.pop("sha256") == _digest(entries):
+                return entries
+        except (ValueError, KeyError, TypeError, AttributeError):
+            pass  # not JSON, or not ours: as damaged as a wrong hash
+        warnings.warn(f"{path}: damaged; made again from the checkpoints beside it.", stacklevel=2)
+    found = []
+    for file in sorted(folder.glob("step-*.pt")):
+        if match := NAME.fullmatch(file.name):
+            entry = {"file": file.name, "step": int(match[1]), "score": None, "sha256": match[2]}
+            state = _read_sound(folder, entry)
+            found += [] if state is None else [entry | {"score": state["score"]}]
+    scored = [entry for entry in found if entry["score"] is not None]
+    best = {"best": min(scored, key=lambda entry: (entry["score"], -entry["step"]))} if scored else {}
+    return {"last": found, **best} if found else {}
+
+
+def _read_sound(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
+    """The state of a listed checkpoint; None when its bytes are not those that were written."""
+    path = folder / entry["file"]
+    data = path.read_bytes() if path.is_file() else b""
+    if not hashlib.sha256(data).hexdigest().startswith(entry["sha256"]):
+        return None
+    return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
 
 
 def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
@@ -82,24 +143,33 @@ def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
         DataError: when checkpoints are listed and none of them is sound.
     """
     entries = read_manifest(folder)
-    listed = [entries["best"]] if which == "best" and "best" in entries else list(reversed(entries.get("last", [])))
+    listed = [entries["best"]] if which == "best" and "best" in entries else []
+    if which == "last":
+        listed = list(reversed(entries.get("last", [])))
     for position, entry in enumerate(listed):
-        path = folder / entry["file"]
-        data = path.read_bytes() if path.is_file() else b""
-        if hashlib.sha256(data).hexdigest() == entry["sha256"]:
-            return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        state = _read_sound(folder, entry)
+        if state is not None:
+            return state
         following = listed[position + 1]["file"] if position + 1 < len(listed) else "nothing"
-        warnings.warn(f"{path}: damaged or missing checkpoint; falling back to {following}.", stacklevel=2)
-    if listed:
+        damaged = folder / entry["file"]
+        warnings.warn(f"{damaged}: damaged or missing checkpoint; falling back to {following}.", stacklevel=2)
+    if listed or (which == "last" and any(folder.glob("step-*.pt"))):
         raise DataError(folder, "no checkpoint listed here is sound.", "Restore one of them or delete the run.")
     return None
 
 
 def write_weights(path: Path, weights: dict[str, Tensor], description: dict[str, Any]) -> None:
-    """Writes weights to share: ``<path>.safetensors`` and ``<path>.json`` (description and sha256)."""
+    """Writes weights to share: ``<path>.safetensors`` and ``<path>.json`` (description and sha256).
+
+    Raises:
+        AvatarError: when a weight is not finite; nothing is written then.
+    """
+    for name, value in weights.items():
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            raise AvatarError(f"{name}: expected finite weights; {path}.safetensors was not written.")
     data = save_tensors({name: value.contiguous().cpu() for name, value in weights.items()})
-    write_whole(path.with_suffix(".safetensors"), data)
     described = description | {"sha256": hashlib.sha256(data).hexdigest()}
+    write_whole(path.with_suffix(".safetensors"), data)
     write_whole(path.with_suffix(".json"), json.dumps(described, indent=1).encode())
 
 
@@ -120,5 +190,6 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise DataError(described, f"expected a description with a sha256 ({error!r}).") from error
     data = weights.read_bytes()
     if hashlib.sha256(data).hexdigest() != expected:
-        raise DataError(weights, "damaged: its sha256 is not the one in its description.", "Export it again.")
+        mend = "Give the command that made it again."
+        raise DataError(weights, "damaged: its sha256 is not the one in its description.", mend)
     return load_tensors(data), description

@@ -12,7 +12,7 @@ from avatar.body.packed import write_template
 from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
-from avatar.geometry.surface import sample_surface
+from avatar.nn.methods import draw_samples
 from avatar.records import Batch
 from avatar.settings import settings_to_dict
 from avatar.training.checkpoints import write_weights
@@ -82,7 +82,7 @@ def fit_code(avatar: TrainedAvatar, batch: Batch, config: FitConfig) -> torch.Te
     batch = replace(batch, outfit_ids=torch.zeros_like(batch.outfit_ids)).to(device)
     vertices, faces = avatar.template.vertices, avatar.template.faces
     generator = torch.Generator().manual_seed(config.seed)
-    samples = sample_surface(vertices, faces, config.points, generator).to(device)
+    samples = draw_samples(model, vertices, faces, config.points, generator).to(device)
     for step in tqdm(range(config.steps), desc="fit", disable=None):
         terms = point_avatar_loss(model(batch, samples), batch, config.loss, step / config.steps)
         optimiser.zero_grad()

@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
 
-from avatar.checks import AvatarError, require
+from avatar.checks import AvatarError, DataError, require
+from avatar.io.npz import write_whole
 
 
 class TrainingLog:
-    """Appends rows to ``metrics.csv``; columns are fixed by the first row, so a resumed run goes on in its file.
+    """Appends rows to ``metrics.csv``; a resumed run goes on in its file.
 
     Rows hold ``split`` (train or validation), ``step``, ``epoch``, ``seconds`` and one column for every term.
     """
 
     def __init__(self, folder: Path, columns: list[str], from_step: int, tensorboard: bool = True):
-        """Opens the log of a run and drops rows past the step a resumed run starts from."""
-        folder.mkdir(parents=True, exist_ok=True)
+        """Opens the log of a run and drops rows past the step a resumed run starts from.
+
+        Raises:
+            DataError: when the log cannot be written; the one there is stays as it is.
+        """
         self.path = folder / "metrics.csv"
         self.columns = ["split", "step", "epoch", "seconds", *columns]
         kept = [row for row in read_log(self.path) if int(row["step"]) <= from_step] if self.path.is_file() else []
-        self.file = self.path.open("w", newline="")
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self.columns, restval="", extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(kept)
+        try:
+            write_whole(self.path, text.getvalue().encode())
+            self.file = self.path.open("a", newline="")
+        except OSError as error:
+            raise self._not_written(error) from error
         self.writer = csv.DictWriter(self.file, self.columns, restval="", extrasaction="ignore")
-        self.writer.writeheader()
-        self.writer.writerows(kept)
         self.board = None
         if tensorboard:
             try:
@@ -32,23 +43,37 @@ class TrainingLog:
                 return
             self.board = require("torch.utils.tensorboard").SummaryWriter(folder / "tensorboard")
 
+    def _not_written(self, error: OSError) -> DataError:
+        return DataError(self.path, f"could not be written ({error.strerror}).", "Make room and run it again.")
+
     def write(self, split: str, step: int, epoch: int, seconds: float, values: dict[str, float]) -> None:
-        """Writes one row and flushes it."""
+        """Writes one row and flushes it.
+
+        Raises:
+            DataError: when the disk refuses.
+        """
         row = {"split": split, "step": step, "epoch": epoch, "seconds": f"{seconds:.2f}"}
-        self.writer.writerow(row | {name: f"{value:.6g}" for name, value in values.items()})
-        self.file.flush()
+        try:
+            self.writer.writerow(row | {name: f"{value:.6g}" for name, value in values.items()})
+            self.file.flush()
+        except OSError as error:
+            raise self._not_written(error) from error
         if self.board:
             for name, value in values.items():
                 self.board.add_scalar(f"{split}/{name}", value, step)
 
     def close(self) -> None:
         """Closes the file and the board."""
-        self.file.close()
+        try:
+            self.file.close()
+        except OSError as error:
+            raise self._not_written(error) from error
         if self.board:
             self.board.close()
 
 
 def read_log(path: Path) -> list[dict[str, str]]:
-    """The rows of a training log."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    """The whole rows of a training log; what a killed run left half-written is passed over."""
+    text = path.read_text(errors="replace")
+    rows = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+    return [row for row in rows if str(row.get("step")).isdigit() and None not in (*row, *row.values())]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,17 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from avatar.checks import AvatarError
-from avatar.geometry.surface import sample_surface
+from avatar.nn.methods import draw_samples
 from avatar.records import Batch, LossTerms, SurfaceSamples
 from avatar.training.checkpoints import load_checkpoint, save_checkpoint
+from avatar.training.distributed import average, current_team, from_lead, gather, gradients_of, share_norms
+from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
 from avatar.training.losses import TERMS, LossConfig, point_avatar_loss
+from avatar.training.signals import StopRequest, stop_requests
 
 MAX_BAD_STEPS = 10
+report = logging.getLogger(__name__)
 
 
 class Schedule(Enum):
@@ -76,7 +82,7 @@ class Trainer:
     """Trains one point avatar in one run folder; running it again goes on where it stopped."""
 
     def __init__(self, model: nn.Module, vertices: Tensor, faces: Tensor, config: TrainConfig, folder: Path):
-        """Prepares training of a network on a template.
+        """Prepares training of a network on a template; under torchrun, as one of a team.
 
         Args:
             model: a network called as ``model(batch, samples) -> Prediction``, with its garment codes in ``codes``.
@@ -87,6 +93,11 @@ class Trainer:
         self.model, self.config, self.folder = model, config, folder
         self.surface = (vertices, faces)
         self.device = next(model.parameters()).device
+        self.team = current_team()
+        if self.team.size > 1:
+            share_norms(model)
+        kept = model.state_dict().keys()
+        self.statistics = [b for name, b in model.named_buffers() if name in kept and b.is_floating_point()]
         codes = [parameter for name, parameter in model.named_parameters() if name == "codes"]
         others = [parameter for name, parameter in model.named_parameters() if name != "codes"]
         groups = [{"params": others, "lr": config.lr}, {"params": codes, "lr": config.code_lr}]
@@ -97,41 +108,73 @@ class Trainer:
     def fit(
         self, batch_at: Callable[[int], Batch], epoch_length: int, validation: Callable[[], Iterable[Batch]]
     ) -> None:
-        """Trains until the budget is spent.
+        """Trains until the budget is spent; holds the lock of the run's folder while it does.
 
         Args:
-            batch_at: the batch of a step; depends on nothing but the step, so that a resumed run sees the same data.
+            batch_at: the batch of a step (in a team: this process's share of it); depends on nothing but the step,
+                so that a resumed run sees the same data.
             epoch_length: steps an epoch.
-            validation: the held-back batches, deterministic.
+            validation: the held-back batches, deterministic, the same in every process.
 
         Raises:
-            AvatarError: when losses or gradients stay non-finite.
+            AvatarError: when losses or gradients stay non-finite, or another job holds the folder.
+            Stopped: after SIGTERM or SIGUSR1, with everything saved.
         """
-        self.resume()
-        columns = ["loss", "chamfer", *TERMS, "lr", "grad_norm"]
-        log = TrainingLog(self.folder, columns, self.step)
-        started = time.monotonic() - self.seconds
-        bar = tqdm(total=self.config.steps, initial=self.step, desc="train", unit="step", disable=None)
-        while self.progress() < 1:
-            terms, rate, norm = self.train_step(batch_at(self.step))
-            self.step, self.seconds = self.step + 1, time.monotonic() - started
-            bar.update()
-            done = self.progress() >= 1
-            epoch = self.step // epoch_length
-            if self.step % self.config.log_every == 0 or done:
-                values = log_values(terms) | {"lr": rate, "grad_norm": norm}
-                log.write("train", self.step, epoch, self.seconds, values)
-                bar.set_postfix(loss=f"{values['loss']:.3f}", chamfer=f"{values['chamfer'] * 1e4:.3f}e-4")
-            score = None
-            if self.step % self.config.validate_every == 0 or done:
-                values = self.validate(validation())
-                if values:
-                    log.write("validation", self.step, epoch, self.seconds, values)
-                    score = values["chamfer"]
-            if self.step % self.config.save_every == 0 or score is not None or done:
-                save_checkpoint(self.folder / "checkpoints", self.state(), self.step, score)
-        bar.close()
-        log.close()
+        with lock_folder(self.folder) if self.team.leads else nullcontext(), stop_requests() as stop:
+            self.resume()
+            columns = ["loss", "chamfer", *TERMS, "lr", "grad_norm"]
+            log = TrainingLog(self.folder, columns, self.step) if self.team.leads else None
+            try:
+                self.run(batch_at, epoch_length, validation, log, stop)
+            finally:
+                if log:
+                    log.close()
+
+    def run(
+        self,
+        batch_at: Callable[[int], Batch],
+        epoch_length: int,
+        validation: Callable[[], Iterable[Batch]],
+        log: TrainingLog | None,
+        stop: StopRequest,
+    ) -> None:
+        """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
+        started, config = time.monotonic() - self.seconds, self.config
+        off = None if log else True  # None: only where somebody watches
+        with tqdm(total=config.steps, initial=self.step, desc="train", unit="step", disable=off) as bar:
+            while self.progress() < 1:
+                terms, rate, norm = self.train_step(batch_at(self.step))
+                self.step += 1
+                stopping = self.tell_time(time.monotonic() - started, stop)
+                bar.update()
+                done = self.progress() >= 1
+                epoch, score = self.step // epoch_length, None
+                if self.step % config.log_every == 0 or done:
+                    values = self.team_mean(log_values(terms)) | {"lr": rate, "grad_norm": float(norm)}
+                    bar.set_postfix(loss=f"{values['loss']:.3f}", chamfer=f"{values['chamfer'] * 1e4:.3f}e-4")
+                    if log:
+                        log.write("train", self.step, epoch, self.seconds, values)
+                if self.step % config.validate_every == 0 or done:
+                    values = self.validate(validation())
+                    score = values.get("chamfer")
+                    if log and values:
+                        log.write("validation", self.step, epoch, self.seconds, values)
+                if self.step % config.save_every == 0 or score is not None or done or stopping:
+                    self.save(score)
+                if stopping and not done:
+                    stop.leave(self.folder)
+
+    def tell_time(self, seconds: float, stop: StopRequest) -> bool:
+        """Sets the clock, one for the whole team, and says whether anyone in it was asked to stop."""
+        told = torch.tensor([seconds, float(stop.number is not None)], dtype=torch.float64)
+        average([told], self.team)
+        self.seconds = float(told[0])
+        return bool(told[1] > 0)
+
+    def team_mean(self, values: dict[str, float]) -> dict[str, float]:
+        """The mean of named values over the team."""
+        told = gather(values, self.team)
+        return {name: sum(each[name] for each in told) / len(told) for name in values}
 
     def progress(self) -> float:
         """Share of the budget that is spent, by steps or by the clock, whichever is further."""
@@ -142,35 +185,47 @@ class Trainer:
         """The template points of a step: one fixed set, or a fresh one every step."""
         seed = self.config.seed * 1_000_003 + (step + 1 if self.config.fresh_points else 0)
         generator = torch.Generator().manual_seed(seed)
-        return sample_surface(*self.surface, self.config.points, generator).to(self.device)
+        return draw_samples(self.model, *self.surface, self.config.points, generator).to(self.device)
 
-    def train_step(self, batch: Batch) -> tuple[LossTerms, float, float]:
-        """One optimiser step; gives the loss terms, the learning rate and the gradient norm."""
+    def train_step(self, batch: Batch) -> tuple[LossTerms, float, Tensor]:
+        """One optimiser step; gives the loss terms, the learning rate and the gradient norm.
+
+        A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were.
+        """
         self.model.train()
         factor = self.rate_factor()
         for group, base in zip(self.optimiser.param_groups, self.base_rates):
             group["lr"] = base * factor
+        before = [statistic.clone() for statistic in self.statistics]
         terms = self.losses(batch.to(self.device), self.samples_at(self.step), self.progress())
         self.optimiser.zero_grad(set_to_none=True)
         terms.total.backward()
+        total = terms.total.detach().clone()
+        if self.team.size > 1:
+            average([*gradients_of(self.model), total], self.team)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip or math.inf)
-        if torch.isfinite(norm) and torch.isfinite(terms.total):
+        if bool(torch.isfinite(norm + total)):
             self.optimiser.step()
             self.bad_steps = 0
-        else:
-            self.bad_steps += 1
-            if self.bad_steps > MAX_BAD_STEPS:
-                raise AvatarError(
-                    f"loss: not finite for {self.bad_steps} steps in a row (step {self.step}, frames "
-                    f"{', '.join(batch.names)}). Lower lr or check these frames; the last checkpoint is sound."
-                )
-        return terms, self.base_rates[0] * factor, float(norm)
+            return terms, self.base_rates[0] * factor, norm
+        for statistic, value in zip(self.statistics, before):
+            statistic.copy_(value)
+        self.bad_steps += 1
+        if self.bad_steps > MAX_BAD_STEPS:
+            raise AvatarError(
+                f"loss: not finite for {self.bad_steps} steps in a row (step {self.step}, frames "
+                f"{', '.join(batch.names)}). Lower lr or check these frames; the last checkpoint is sound."
+            )
+        return terms, self.base_rates[0] * factor, norm
 
     def losses(self, batch: Batch, samples: SurfaceSamples, progress: float) -> LossTerms:
         """Prediction in the configured precision, then the losses in float32."""
         narrow = self.config.precision is Precision.bf16
         with torch.autocast(self.device.type, torch.bfloat16) if narrow else nullcontext():
             prediction = self.model(batch, samples)
+        if not prediction.points.is_cuda and not torch.isfinite(prediction.points).all():
+            undefined = prediction.points.sum() * math.nan  # as on CUDA, where neighbours of NaN are not refused
+            return LossTerms(dict.fromkeys(TERMS, undefined), {"points_to_scan": undefined})
         return point_avatar_loss(prediction, batch, self.config.loss, progress)
 
     def rate_factor(self) -> float:
@@ -187,15 +242,23 @@ class Trainer:
         samples = self.samples_at(-1)
         sums: dict[str, float] = {}
         frames = 0
-        for batch in batches:
+        for batch in islice(batches, self.team.rank, None, self.team.size):
             count = len(batch.names)
             for name, value in log_values(self.losses(batch.to(self.device), samples, 1.0)).items():
                 sums[name] = sums.get(name, 0.0) + value * count
             frames += count
-        return {name: value / frames for name, value in sums.items()}
+        told = gather((sums, frames), self.team)
+        frames = sum(count for _, count in told)
+        return {name: sum(each.get(name, 0.0) for each, _ in told) / frames for name in told[0][0]}
+
+    def save(self, score: float | None) -> None:
+        """Writes a checkpoint; in a team the leading process does, with everyone's random state."""
+        state = self.state()
+        if self.team.leads:
+            save_checkpoint(self.folder / "checkpoints", state, self.step, score)
 
     def state(self) -> dict[str, Any]:
-        """Everything a resumed run needs."""
+        """Everything a resumed run needs: tensors and plain values."""
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
@@ -204,21 +267,30 @@ class Trainer:
             "optimiser": self.optimiser.state_dict(),
             "step": self.step,
             "seconds": self.seconds,
-            "random": random,
+            "random": gather(random, self.team),
+            "threads": torch.get_num_threads(),
         }
 
     def resume(self) -> None:
         """Goes back to the newest sound checkpoint; seeds the random state when there is none."""
-        state = load_checkpoint(self.folder / "checkpoints")
+        team = self.team
+        state = from_lead(load_checkpoint(self.folder / "checkpoints") if team.leads else None, team)
+        torch.manual_seed(self.config.seed + 1_000_003 * team.rank)
         if state is None:
-            torch.manual_seed(self.config.seed)
+            weights = {name: value.cpu() for name, value in self.model.state_dict().items()}
+            self.model.load_state_dict(from_lead(weights, team))
             return
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.seconds = state["step"], state["seconds"]
-        torch.set_rng_state(state["random"]["cpu"])
-        if "cuda" in state["random"] and self.device.type == "cuda":
-            torch.cuda.set_rng_state(state["random"]["cuda"], self.device)
+        before = (state["threads"], len(state["random"]))
+        if before != (torch.get_num_threads(), team.size):
+            report.info("Going on with other threads or processes than before: equal to rounding, not to the bit.")
+        if len(state["random"]) == team.size:
+            random = state["random"][team.rank]
+            torch.set_rng_state(random["cpu"])
+            if "cuda" in random and self.device.type == "cuda":
+                torch.cuda.set_rng_state(random["cuda"], self.device)
 
 
 def log_values(terms: LossTerms) -> dict[str, float]:

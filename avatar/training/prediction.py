@@ -12,24 +12,25 @@ from tqdm import tqdm
 from avatar.checks import AvatarError, check_shape
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
-from avatar.geometry.surface import sample_surface
 from avatar.io.points import write_points
-from avatar.records import Batch, BodyFit, Motion, PointCloud, Prediction, SurfaceSamples, Template
+from avatar.nn.methods import draw_samples
+from avatar.records import Batch, BodyFit, Motion, PointCloud, Prediction, SurfaceSamples
 from avatar.training.runs import TrainedAvatar
 
 MAX_POINTS = 400_000
 CHUNK = 100_000  # points decoded at once; the network is pointwise, so chunks change nothing
 
 
-def template_samples(template: Template, points: int, seed: int = 0) -> SurfaceSamples:
-    """The template points a prediction is made at: spread evenly by area, fixed by the seed.
+def template_samples(avatar: TrainedAvatar, points: int, seed: int = 0) -> SurfaceSamples:
+    """The template points a prediction is made at: spread evenly by area, fixed by the seed, or the network's own.
 
     Raises:
         AvatarError: for a count out of 1,000 to 400,000.
     """
     if not 1000 <= points <= MAX_POINTS:
         raise AvatarError(f"points: expected 1,000 to {MAX_POINTS:,}, got {points}.")
-    return sample_surface(template.vertices, template.faces, points, torch.Generator().manual_seed(seed))
+    template, generator = avatar.template, torch.Generator().manual_seed(seed)
+    return draw_samples(avatar.model, template.vertices, template.faces, points, generator)
 
 
 def body_batch(bodies: list[BodyFit], outfit: int, names: tuple[str, ...]) -> Batch:
@@ -88,7 +89,7 @@ def predict_frames(
         keep: which frames, by name; all of them by default.
     """
     index = outfit_index(avatar, outfit.name)
-    samples = template_samples(avatar.template, points)
+    samples = template_samples(avatar, points)
     written = []
     for name in tqdm([n for n in outfit.frames(split) if keep(n)], desc=f"predict {outfit.name}", disable=None):
         batch = body_batch([outfit.load(split, name).body], index, (name,))
@@ -111,7 +112,7 @@ def outfit_index(avatar: TrainedAvatar, name: str) -> int:
 def predict_motion(avatar: TrainedAvatar, outfit: OpenOutfit, motion: Motion, folder: Path, points: int) -> list[Path]:
     """Writes ``<folder>/<motion>.<frame>.ply`` for every frame of a motion; points keep their order over time."""
     index = outfit_index(avatar, outfit.name)
-    samples = template_samples(avatar.template, points)
+    samples = template_samples(avatar, points)
     check_shape("poses", motion.poses, "T J 3", J=len(outfit.body.parents))
     written = []
     for frame in tqdm(range(len(motion.poses)), desc=f"predict {motion.name}", disable=None):
@@ -131,6 +132,6 @@ def garment_template_cloud(avatar: TrainedAvatar, outfit: str, points: int) -> P
     if not hasattr(avatar.model, "garment_template"):
         raise AvatarError(f"method: {avatar.config.method.name} has no explicit garment template.")
     device = next(avatar.model.parameters()).device
-    samples = template_samples(avatar.template, points).to(device)
+    samples = template_samples(avatar, points).to(device)
     decoded = avatar.model.garment_template(outfit_index(avatar, outfit), samples)
     return join_clouds([Prediction(decoded.offsets, decoded.normals, decoded.offsets)])

@@ -1,6 +1,9 @@
 """The training loop: resuming, budgets, bookkeeping and its guards, on a small sphere of a body."""
 
+import errno
 import math
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,11 +11,15 @@ import pytest
 import torch
 from spheres import TEMPLATE, random_batch, small_config
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, DataError
 from avatar.nn.closet import ClosetAvatar
+from avatar.training import checkpoints
+from avatar.training.checkpoints import load_checkpoint
+from avatar.training.locks import HELD, lock_folder
 from avatar.training.logs import read_log
 from avatar.training.loop import Schedule, TrainConfig, Trainer
 from avatar.training.losses import TERMS
+from avatar.training.signals import Stopped
 
 
 def make_trainer(folder: Path, **options) -> Trainer:
@@ -44,6 +51,79 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path, stop):
     assert parts.step == 8
     for name, value in whole.model.state_dict().items():
         assert torch.equal(value, parts.model.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_signal_saves_and_the_run_goes_on_as_if_nothing_had_been(tmp_path, number):
+    options = {"steps": 6, "save_every": 100, "validate_every": 3}
+    whole = fit(make_trainer(tmp_path / "whole", **options))
+
+    def signalled(step: int):
+        if step == 3:
+            os.kill(os.getpid(), number)
+        return random_batch()
+
+    with pytest.raises(Stopped, match="The same command goes on"):
+        fit(make_trainer(tmp_path / "parts", **options), signalled)
+    assert load_checkpoint(tmp_path / "parts" / "checkpoints")["step"] == 4  # the step at hand was finished
+    parts = fit(make_trainer(tmp_path / "parts", **options))
+    for name, value in whole.model.state_dict().items():
+        assert torch.equal(value, parts.model.state_dict()[name]), name
+
+
+def test_a_run_folder_takes_one_job_and_is_free_after_it(tmp_path):
+    second = make_trainer(tmp_path, steps=2)
+
+    def nested(step: int):
+        if step == 1:
+            refused = os.fork()
+            if refused == 0:
+                try:
+                    HELD.clear()  # what a fork takes over, another job would not have
+                    fit(second)
+                except AvatarError as error:
+                    os._exit(7 if f"process {os.getppid()}" in str(error) else 8)
+                os._exit(9)
+            assert os.waitstatus_to_exitcode(os.waitpid(refused, 0)[1]) == 7
+        return random_batch()
+
+    assert fit(make_trainer(tmp_path, steps=2), nested).step == 2
+    with lock_folder(tmp_path):
+        pass
+
+
+def test_a_full_disk_ends_training_with_the_last_checkpoint_sound(tmp_path, monkeypatch):
+    fit(make_trainer(tmp_path, steps=3))
+    rows = (tmp_path / "metrics.csv").read_text()
+
+    def full(path, data):
+        if path.suffix == refused[-1]:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, data)
+
+    write, refused = checkpoints.write_whole, []
+    monkeypatch.setattr(checkpoints, "write_whole", full)
+    monkeypatch.setattr("avatar.training.logs.write_whole", full)
+    for kind in (".pt", ".json", ".csv"):
+        refused.append(kind)
+        with pytest.raises(DataError, match="No space left"):
+            fit(make_trainer(tmp_path, steps=5))
+        assert load_checkpoint(tmp_path / "checkpoints")["step"] == 3
+        assert (tmp_path / "metrics.csv").read_text().startswith(rows)
+
+
+def test_a_half_written_log_is_read_as_far_as_it_goes(tmp_path):
+    fit(make_trainer(tmp_path, steps=3))
+    path = tmp_path / "metrics.csv"
+    rows = read_log(path)
+    whole, last = path.read_text(), ",".join(rows[-1].values()) + "\n"
+    for cut in range(1, len(last), 7):
+        path.write_text(whole + last[:-cut])
+        assert read_log(path) == rows
+    path.write_text(whole)
+    path.write_bytes(path.read_bytes() + b"\xff\x00garbage\n")
+    fit(make_trainer(tmp_path, steps=4))
+    assert [row["step"] for row in read_log(path) if row["split"] == "train"] == ["1", "2", "3", "4"]
 
 
 def test_log_has_every_term_of_every_step_once_even_after_resuming(tmp_path):
@@ -95,6 +175,23 @@ def test_non_finite_losses_leave_the_weights_alone_and_end_training(tmp_path):
     with pytest.raises(AvatarError, match=r"not finite for 11 steps.*walk\.00000"):
         fit(trainer, lambda step: broken)
     assert all(torch.equal(value, before[name]) for name, value in trainer.model.named_parameters())
+
+
+def test_a_bad_step_leaves_no_trace(tmp_path):
+    """Running statistics too: a forward pass in training changes them before anyone knows that the loss is bad."""
+    trainer = make_trainer(tmp_path, steps=30)
+    trainer.train_step(random_batch())
+    before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
+    moments = [value.clone() for group in trainer.optimiser.state.values() for value in group.values()]
+    good = random_batch()
+    broken = replace(good, pose_vertices=torch.full_like(good.pose_vertices, float("inf")))
+    assert not math.isfinite(float(trainer.train_step(broken)[2]))
+    for name, value in trainer.model.state_dict().items():
+        assert torch.equal(value, before[name]) or name.endswith("num_batches_tracked"), name
+    after = [value for group in trainer.optimiser.state.values() for value in group.values()]
+    assert all(torch.equal(a, b) for a, b in zip(moments, after))
+    trainer.train_step(good)
+    trainer.save(0.0)
 
 
 def test_wrong_options_are_refused_by_name():

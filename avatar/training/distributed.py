@@ -1,0 +1,182 @@
+"""Data-parallel training under torchrun: every process takes its share of each batch, and all take the same step.
+
+Gradients are averaged and the statistics of every normalisation are those of the whole batch, so a run gives the
+losses of one process with the same batch, to rounding (with noise on the input: in distribution). NCCL serves CUDA,
+gloo the CPU.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from avatar.checks import AvatarError
+from avatar.nn.pointnet2 import PointNorm
+
+
+@dataclass(frozen=True)
+class Team:
+    """The processes of one run: ``rank`` is this one's number, ``size`` how many there are."""
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes the files and talks to the user."""
+        return self.rank == 0
+
+    def share(self, batch: int) -> slice:
+        """The frames of a batch that are this process's own.
+
+        Raises:
+            AvatarError: when a batch cannot be shared out evenly.
+        """
+        if batch % self.size:
+            raise AvatarError(f"batch: expected a multiple of the {self.size} processes, got {batch}.")
+        count = batch // self.size
+        return slice(self.rank * count, (self.rank + 1) * count)
+
+
+def current_team() -> Team:
+    """The team this process has joined; alone if none."""
+    if dist.is_available() and dist.is_initialized():
+        return Team(dist.get_rank(), dist.get_world_size())
+    return Team()
+
+
+@contextmanager
+def torchrun_team() -> Iterator[Team]:
+    """Joins the team that torchrun started for the length of a ``with`` block; without torchrun there is none."""
+    if int(os.environ.get("WORLD_SIZE", "1")) < 2 or "LOCAL_RANK" not in os.environ:
+        yield Team()
+        return
+    local, cuda = int(os.environ["LOCAL_RANK"]), torch.cuda.is_available()
+    if cuda:
+        if local >= torch.cuda.device_count():
+            raise AvatarError(f"--nproc-per-node: expected at most {torch.cuda.device_count()} here (CUDA devices).")
+        torch.cuda.set_device(local)
+    dist.init_process_group("cpu:gloo,cuda:nccl" if cuda else "gloo")
+    try:
+        yield current_team()
+    finally:
+        dist.destroy_process_group()
+
+
+def average(tensors: list[Tensor], team: Team) -> None:
+    """Replaces tensors by their mean over the team, in one exchange; every process gets the same bits."""
+    if team.size == 1:
+        return
+    flat = torch.cat([tensor.flatten() for tensor in tensors])
+    dist.all_reduce(flat)
+    flat /= team.size
+    for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
+        tensor.copy_(mean.view_as(tensor))
+
+
+def gradients_of(model: nn.Module) -> list[Tensor]:
+    """The gradients of a model, zero for a parameter this process did not come by, so that all lists are alike."""
+    for parameter in model.parameters():
+        if parameter.requires_grad and parameter.grad is None:
+            parameter.grad = torch.zeros_like(parameter)
+    return [parameter.grad for parameter in model.parameters() if parameter.requires_grad]
+
+
+def gather(value: Any, team: Team) -> list[Any]:
+    """A plain value of every process, in the order of ranks; all processes get all."""
+    if team.size == 1:
+        return [value]
+    values: list[Any] = [None] * team.size
+    dist.all_gather_object(values, value)
+    return values
+
+
+def from_lead(value: Any, team: Team) -> Any:
+    """The leading process's value, in every process."""
+    if team.size == 1:
+        return value
+    values = [value]
+    dist.broadcast_object_list(values, src=0)
+    return values[0]
+
+
+class _GatherMoments(torch.autograd.Function):
+    """Stacks every process's moments ``(2 C + 1,)`` to ``(P, 2 C + 1)``; a gradient goes back to where it came from."""
+
+    @staticmethod
+    def forward(context: Any, moments: Tensor) -> Tensor:
+        gathered = [torch.empty_like(moments) for _ in range(dist.get_world_size())]
+        dist.all_gather(gathered, moments.contiguous())
+        return torch.stack(gathered)
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> Tensor:
+        gradient = gradient.contiguous().clone()
+        dist.all_reduce(gradient)
+        return gradient[dist.get_rank()]
+
+
+class SharedNorm(_BatchNorm):
+    """Batch normalisation over the whole team's batch, with the parameters and buffers of the layer it stands for.
+
+    nn.SyncBatchNorm does this on CUDA alone. Each process gives count, mean and variance; the team's follow from
+    them without cancellation (Chan's formula).
+    """
+
+    dimension = -1  # of the channels
+
+    def _check_input_dim(self, features: Tensor) -> None:
+        """Any shape with channels in `dimension` will do."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Normalises ``(..., C, ...)`` features; in evaluation by the running statistics."""
+        rows = features.movedim(self.dimension, -1)
+        flat = rows.flatten(0, -2).to(torch.promote_types(rows.dtype, torch.float32))
+        if self.training:
+            mean, variance, count = self.team_moments(flat)
+            with torch.no_grad():
+                self.num_batches_tracked += 1
+                self.running_mean.lerp_(mean, self.momentum)
+                self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)
+        else:
+            mean, variance = self.running_mean, self.running_var
+        flat = (flat - mean) * (variance + self.eps).rsqrt()
+        if self.affine:
+            flat = flat * self.weight + self.bias
+        return flat.to(features.dtype).view_as(rows).movedim(-1, self.dimension)
+
+    def team_moments(self, flat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, variance ``(C,)`` and number of all rows of the team, from this process's ``(n, C)``."""
+        channels = flat.shape[1]
+        local = [flat.mean(dim=0), flat.var(dim=0, correction=0), flat.new_tensor([len(flat)])]
+        means, variances, counts = _GatherMoments.apply(torch.cat(local)).split([channels, channels, 1], dim=1)
+        weights = counts.detach() / counts.detach().sum()
+        mean = (weights * means).sum(dim=0)
+        variance = (weights * (variances + (means - mean).square())).sum(dim=0)
+        return mean, variance, counts.detach().sum()
+
+
+def share_norms(model: nn.Module) -> None:
+    """Turns every batch normalisation of a model into a `SharedNorm`, in place; names and weights stay the same.
+
+    Raises:
+        AvatarError: for a kind of normalisation whose statistics it would not know how to share.
+    """
+    for parent in list(model.modules()):
+        for name, layer in parent.named_children():
+            if not isinstance(layer, _BatchNorm) or isinstance(layer, SharedNorm):
+                continue
+            if type(layer) not in (PointNorm, nn.BatchNorm1d, nn.BatchNorm2d) or layer.running_mean is None:
+                raise AvatarError(f"{type(layer).__name__}: not known to data-parallel training. Use one process.")
+            shared = SharedNorm(layer.num_features, layer.eps, layer.momentum, layer.affine)
+            shared.dimension = -1 if isinstance(layer, PointNorm) else 1
+            shared._parameters, shared._buffers = layer._parameters, layer._buffers
+            setattr(parent, name, shared.train(layer.training))

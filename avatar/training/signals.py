@@ -1,0 +1,82 @@
+"""Being asked to stop: SIGTERM and SIGUSR1 are noted, and the work ends where its state can be saved."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+STOPPED = os.EX_TEMPFAIL  # exit code 75: nothing is wrong, the same command goes on
+SIGNALS = (signal.SIGTERM, signal.SIGUSR1)
+
+
+class Stopped(Exception):
+    """The work was asked to stop and its state is saved. No `AvatarError`: nothing is wrong."""
+
+
+@contextmanager
+def listening(listener: Callable[[int, FrameType | None], Any], numbers: Iterable[int]) -> Iterator[dict[int, Any]]:
+    """Has signals heard by a function for the length of a ``with`` block; gives who listened before.
+
+    Outside the main thread Python has no signals: nothing is heard then.
+    """
+    ours = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, listener) for number in numbers} if ours else {}
+    try:
+        yield before
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+@contextmanager
+def leave_when_asked(passed_on: Callable[[int], bool] = lambda number: False) -> Iterator[None]:
+    """Leaves with exit code 75 when asked to stop, but when ``passed_on`` says that others do in this one's place."""
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        if not passed_on(number):
+            sys.exit(STOPPED)
+
+    with listening(leave, SIGNALS):
+        yield
+
+
+class StopRequest:
+    """A signal that asks to stop, noted and not obeyed until the state is saved: ``number``, or None.
+
+    SIGUSR2 is noted too where somebody listens to it already (submitit does, to queue a job again).
+    """
+
+    def __init__(self):
+        self.number: int | None = None
+        self.earlier: dict[int, Any] = {}
+
+    def note(self, number: int, frame: FrameType | None) -> None:
+        """Keeps the first signal; those that follow change nothing, so that a save is never cut short."""
+        self.number = self.number or number
+
+    def leave(self, folder: Path) -> None:
+        """Ends the work once its state is saved; who listened to SIGUSR2 before hears it now.
+
+        Raises:
+            Stopped: always, unless the earlier listener leaves on its own.
+        """
+        if self.number == signal.SIGUSR2:
+            self.earlier[self.number](self.number, None)
+        name = signal.Signals(self.number).name if self.number else "another process"
+        raise Stopped(f"{folder}: stopped by {name}, everything is saved. The same command goes on from here.")
+
+
+@contextmanager
+def stop_requests() -> Iterator[StopRequest]:
+    """Notes the signals that ask to stop, for the length of a ``with`` block."""
+    request = StopRequest()
+    others = (signal.SIGUSR2,) if callable(signal.getsignal(signal.SIGUSR2)) else ()
+    with listening(request.note, (*SIGNALS, *others)) as request.earlier:
+        yield request
