@@ -1,0 +1,75 @@
+"""`canonicalize`: posed raw scans to T-pose scans and a skinning field, with pictures of both."""
+
+from __future__ import annotations
+
+import colorsys
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from avatar.data.batches import FrameDataset
+from avatar.export.drawing import Camera, frame_camera
+from avatar.export.pictures import contact_sheet, render_mesh, render_points, save_picture
+from avatar.io.canonical_scans import read_canonical_scan
+from avatar.pipeline.surfaces import spaced_frames
+from avatar.records import Mesh, PointCloud
+from avatar.training.canonicalizing import CanonicalizeConfig, canonicalize_frames, train_canonicalizer
+
+COLUMNS = ("scan", "weights", "canonical, front", "canonical, back", "weights, front", "weights, back")
+PICTURE = (480, 480)
+
+
+def canonicalize(config: CanonicalizeConfig) -> Path:
+    """Trains or resumes a run's canonicalizer, writes every frame's canonical scan, draws some; gives the folder."""
+    frames = config.frames()
+    train_canonicalizer(config, frames)
+    canonicalize_frames(config, frames)
+    draw_canonical_scans(config, frames)
+    return config.folder
+
+
+def draw_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> list[Path]:
+    """Writes ``<run>/pictures/<split>.png``: some scans before and after, by their normals and skinning weights."""
+    written = []
+    places = {(where.split, where.name): index for index, where in enumerate(frames.names)}
+    for split in dict.fromkeys(where.split for where in frames.names):
+        chosen = spaced_frames([name for of, name in places if of == split], config.pictures)
+        if not chosen:
+            continue
+        rows = [draw_frame(config, frames, places[split, name]) for name in tqdm(chosen, desc="pictures", disable=None)]
+        written.append(config.folder / "pictures" / f"{split}.png")
+        save_picture(written[-1], contact_sheet(rows, chosen, COLUMNS))
+    return written
+
+
+def draw_frame(config: CanonicalizeConfig, frames: FrameDataset, index: int) -> list[np.ndarray]:
+    """The row of pictures of one frame."""
+    where = frames.names[index]
+    scan = frames.frame(index).scan
+    canonical = read_canonical_scan(config.folder / "scans" / where.split / f"{where.name}.npz")
+    tints = weight_colors(canonical.weights)
+    grey = np.full_like(scan.points, 0.6)
+    grey[canonical.source] = tints
+    posed, front = (frame_camera(points, size=PICTURE) for points in (scan.points, canonical.points))
+    before = (scan.points, scan.normals, scan.faces)
+    after = (canonical.points, canonical.normals, canonical.faces)
+    views = [(before, posed, "normals"), (before, posed, grey)]
+    views += [(after, front.seen_from(side), colors) for colors in ("normals", tints) for side in ("front", "back")]
+    return [draw_surface(*surface, camera, colors) for surface, camera, colors in views]
+
+
+def draw_surface(
+    points: np.ndarray, normals: np.ndarray, faces: np.ndarray | None, camera: Camera, colors: str | np.ndarray
+) -> np.ndarray:
+    """A picture of a scan of either kind."""
+    if faces is None:
+        return render_points(PointCloud(points, normals), camera, colors)
+    return render_mesh(Mesh(points, faces), camera, colors)
+
+
+def weight_colors(weights: np.ndarray) -> np.ndarray:
+    """Skinning weights ``(M, J)`` as colours ``(M, 3)``: each joint has its own, neighbours in number far apart."""
+    hues = (np.arange(weights.shape[1]) * 0.381966) % 1  # the golden section spreads them
+    palette = np.array([colorsys.hsv_to_rgb(hue, 0.75, 0.95) for hue in hues])
+    return np.clip(weights @ palette, 0, 1)

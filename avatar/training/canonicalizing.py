@@ -1,0 +1,252 @@
+"""SCANimate's first learned stage as runs: a canonicalizer from its settings to its folder and back, and its scans."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from avatar.body.packed import read_template, write_template
+from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
+from avatar.canonical.fields import SkinningField, bounding_box
+from avatar.canonical.posed import prepare_scan, to_root_frame
+from avatar.canonical.rivals import KNN, NearestBody, SkinningSource
+from avatar.canonical.scans import STRETCH, canonicalize_scan
+from avatar.checks import AvatarError, DataError
+from avatar.data.batches import FrameDataset, name_frames
+from avatar.data.layouts import find_outfit
+from avatar.data.outfits import SAFE_NAME, Outfit
+from avatar.data.scanner import SCANNERS, ScanConfig
+from avatar.data.splits import SplitConfig, split_outfit
+from avatar.io.canonical_scans import read_canonical_scan, read_stamp, write_canonical_scan
+from avatar.io.meshes import write_mesh
+from avatar.io.points import write_points
+from avatar.records import CanonicalScan, Frame, Mesh, PointCloud, Template
+from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.training.checkpoints import read_weights, write_weights
+from avatar.training.cycles import CycleConfig, CycleTrainer, find_code
+from avatar.training.runs import choose_device, save_settings
+
+WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
+CHUNK = 20_000  # points asked about at once
+POSES = "learned_poses"
+
+
+class Skinning(Enum):
+    """Whose skinning weights carry a scan to the canonical pose."""
+
+    learned = "learned"
+    nearest = "nearest"  # the nearest body vertex's
+    knn = "knn"  # the six nearest ones'
+
+
+@dataclass
+class CanonicalizeConfig:
+    """One outfit's scans to the canonical pose: with what, and where."""
+
+    dataset: str = "sample"
+    outfit: str = "dress"
+    name: str = "default"
+    data_root: Path = Path("data")
+    runs_root: Path = Path("runs")
+    weights: Skinning = Skinning.learned
+    scan: ScanConfig = field(default_factory=lambda: replace(SCANNERS["raw"]))
+    split: SplitConfig = field(default_factory=lambda: SplitConfig(validation_share=0.0))
+    canonicalizer: CanonicalizerConfig = field(default_factory=CanonicalizerConfig)
+    train: CycleConfig = field(default_factory=CycleConfig)
+    stretch: float = STRETCH  # longest that an edge of a scan may become, as a multiple
+    pictures: int = 4  # frames of each split in pictures
+    device: str = "auto"  # auto takes CUDA where there is one
+
+    def __post_init__(self):
+        if not SAFE_NAME.fullmatch(self.name):
+            raise AvatarError(f"name: expected a plain name (letters, digits, '_', '.', '-'), got {self.name!r}.")
+        if self.stretch <= 1 or self.pictures < 0:
+            raise AvatarError(
+                f"stretch: expected above 1, pictures: at least 0; got {self.stretch} and {self.pictures}."
+            )
+
+    @property
+    def folder(self) -> Path:
+        """Where the run lives: ``<runs>/canonical/<dataset>/<outfit>/<name>``."""
+        return self.runs_root / "canonical" / self.dataset / self.outfit / self.name
+
+    def find_outfit(self) -> Outfit:
+        """The outfit on disk."""
+        return find_outfit(self.data_root, self.dataset, self.outfit, self.scan)
+
+    def frames(self) -> FrameDataset:
+        """The frames that are canonicalized: first those of training, which are learned from, then those of test."""
+        outfit = self.find_outfit()
+        names = name_frames([outfit], "train", [split_outfit(outfit, self.split).train])
+        if (outfit.path / "test").is_dir():
+            names += name_frames([outfit], "test", [outfit.frames("test")])
+        return FrameDataset([outfit], names, points=1)
+
+
+@dataclass(frozen=True)
+class TrainedCanonicalizer:
+    """A trained canonicalizer with what it was trained on; gives any frame of its outfit skinning weights.
+
+    ``frames`` are the names of the training frames in the order of the model's codes, ``poses (frames, J, 4, 4)``
+    their joint transforms in root frames; ``steps`` and ``seconds`` of training.
+    """
+
+    model: Canonicalizer
+    template: Template
+    config: CanonicalizeConfig
+    frames: tuple[str, ...]
+    poses: Tensor
+    steps: int
+    seconds: float
+
+    @property
+    def forward_field(self) -> SkinningField:
+        """Skinning weights of canonical space: frozen, differentiable in the points."""
+        return copy.deepcopy(self.model.forward_field).eval().requires_grad_(False)
+
+    def code_of(self, frame: Frame) -> Tensor:
+        """The code ``(L,)`` of a frame: the learned one, or found for its scan where it was not learned from."""
+        codes = self.model.codes.detach()
+        learned = frame.split == "train" and frame.outfit == self.config.outfit and frame.name in self.frames
+        if learned and self.model.config.latent is Latent.auto_decoded:
+            return codes[self.frames.index(frame.name)]
+        scan = prepare_scan(frame, self.template, self.config.train.draw.pool)
+        alike = (self.poses - scan.joint_transforms).square().sum(dim=(1, 2, 3)).argmin()
+        return find_code(self.model, self.template.to(codes.device), scan, codes[alike], self.config.train)
+
+    def weights_of(self, points: np.ndarray, frame: Frame) -> np.ndarray:
+        """Weights ``(M, J)`` of posed points ``(M, 3)`` in the frame's world, metres (see `SkinningSource`)."""
+        code = self.code_of(frame)[None]
+        box = bounding_box(to_root_frame(frame.body.vertices, frame.body))[None].to(code.device)
+        places = to_root_frame(points, frame.body).to(code.device)
+        with torch.no_grad():
+            parts = [self.model.inverse(part[None], code, box)[0] for part in places.split(CHUNK)]
+        return torch.cat(parts).cpu().numpy()
+
+
+def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None = None) -> Path:
+    """Trains a run's canonicalizer, or goes on with it; gives the run's folder. Rivals have nothing to learn.
+
+    Args:
+        config: the run.
+        frames: its frames, where somebody has them in memory already.
+
+    Raises:
+        AvatarError: when the folder holds a run with other settings, or training fails.
+    """
+    frames = frames or config.frames()
+    template = frames.outfits[0].template
+    save_settings(config)
+    write_template(config.folder / "template.npz", template)
+    if config.weights is not Skinning.learned or is_trained(config):
+        return config.folder
+    learned = [index for index, where in enumerate(frames.names) if where.split == "train"]
+    pool = config.train.draw.pool
+    scans = [
+        prepare_scan(frames.frame(index), template, pool, config.train.seed)
+        for index in tqdm(learned, desc="prepare scans", disable=None)
+    ]
+    names = [frames.names[index].name for index in learned]
+    torch.manual_seed(config.train.seed)
+    model = Canonicalizer(template, len(scans), config.canonicalizer).to(choose_device(config.device))
+    trainer = CycleTrainer(model, template, scans, names, config.train, config.folder)
+    trainer.fit()
+    poses = torch.stack([scan.joint_transforms for scan in scans])
+    facts = {"config": settings_to_dict(config), "frames": names, "steps": trainer.step, "seconds": trainer.seconds}
+    write_weights(config.folder / WEIGHTS, model.state_dict() | {POSES: poses}, facts)
+    return config.folder
+
+
+def is_trained(config: CanonicalizeConfig) -> bool:
+    """Whether a run's canonicalizer is there, sound and trained to its end."""
+    try:
+        return read_weights(config.folder / WEIGHTS)[1]["steps"] >= config.train.steps
+    except DataError:
+        return False
+
+
+def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicalizer:
+    """The trained canonicalizer of a run's folder.
+
+    Raises:
+        DataError: when the folder is no finished run of learned weights, or a file in it is damaged.
+    """
+    if not (folder / f"{WEIGHTS}.json").is_file():
+        mend = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
+        raise DataError(folder, "no trained canonicalizer here.", mend)
+    weights, facts = read_weights(folder / WEIGHTS)
+    config = settings_from_dict(CanonicalizeConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
+    template, poses = read_template(folder / "template.npz"), weights.pop(POSES)
+    model = Canonicalizer(template, len(facts["frames"]), config.canonicalizer)
+    model.load_state_dict(weights)
+    model = model.to(choose_device(device)).eval().requires_grad_(False)
+    return TrainedCanonicalizer(
+        model, template, config, tuple(facts["frames"]), poses, facts["steps"], facts["seconds"]
+    )
+
+
+def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None = None) -> list[Path]:
+    """Writes every frame's canonical scan to ``<run>/scans/<split>/<frame>.npz``; gives the files in order.
+
+    Training frames get a ``<frame>.ply`` beside it, for other programs. What an earlier call with the same weights
+    and settings has finished is checked and left as it is.
+    """
+    frames = frames or config.frames()
+    template = frames.outfits[0].template
+    source, stamp = skinning_source(config, template), stamp_of(config)
+    written = []
+    for index, where in enumerate(tqdm(frames.names, desc="canonicalize", unit="scan", disable=None)):
+        path = config.folder / "scans" / where.split / f"{where.name}.npz"
+        written.append(path)
+        picture = path.with_suffix(".ply") if where.split == "train" else path
+        if picture.is_file() and is_finished(path, stamp):
+            continue
+        frame = frames.frame(index)
+        weights = source.weights_of(frame.scan.points, frame)
+        scan = canonicalize_scan(frame.scan, frame.body, weights, template, config.stretch)
+        if where.split == "train":
+            write_surface(picture, scan)
+        write_canonical_scan(path, scan, stamp)
+    return written
+
+
+def skinning_source(config: CanonicalizeConfig, template: Template) -> SkinningSource:
+    """What gives a run's scans their weights: its trained canonicalizer, or the body nearby."""
+    if config.weights is Skinning.learned:
+        return load_canonicalizer(config.folder, config.device)
+    return NearestBody(template, KNN if config.weights is Skinning.knn else 1)
+
+
+def stamp_of(config: CanonicalizeConfig) -> str:
+    """A hash of all that a run's canonical scans depend on but the data: weights, scanner and cut."""
+    plain = settings_to_dict(config)
+    parts = {key: plain[key] for key in ("weights", "scan", "stretch")}
+    if config.weights is Skinning.learned:
+        parts["learned"] = hashlib.sha256((config.folder / f"{WEIGHTS}.safetensors").read_bytes()).hexdigest()
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def is_finished(path: Path, stamp: str) -> bool:
+    """Whether a canonical scan is there, sound and made by what the stamp stands for."""
+    try:
+        read_canonical_scan(path)
+        return read_stamp(path) == stamp
+    except DataError:
+        return False
+
+
+def write_surface(path: Path, scan: CanonicalScan) -> None:
+    """A canonical scan for other programs: a mesh where it is one, oriented points otherwise."""
+    if scan.faces is None:
+        write_points(path, PointCloud(scan.points, scan.normals))
+    else:
+        write_mesh(path, Mesh(scan.points, scan.faces, scan.colors))

@@ -1,0 +1,272 @@
+"""Canonicalizers as runs: they learn, resume to the bit, come back from disk, canonicalize seen and unseen frames."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from limbs import arm_frame, arm_template, legs_template, skirt_frame
+
+import avatar.training.cycles as cycles
+from avatar.body.skinning import skin_transforms
+from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
+from avatar.canonical.fields import SkinningFieldConfig
+from avatar.canonical.losses import TERMS
+from avatar.canonical.posed import DrawConfig, prepare_scan, to_root_frame
+from avatar.checks import AvatarError, DataError
+from avatar.data.scanner import ScanConfig
+from avatar.geometry.transforms import transform_points
+from avatar.io.canonical_scans import read_canonical_scan, read_stamp
+from avatar.io.meshes import read_mesh
+from avatar.io.points import read_points
+from avatar.pipeline.canonicalization import canonicalize, weight_colors
+from avatar.training.canonicalizing import (
+    CanonicalizeConfig,
+    Skinning,
+    canonicalize_frames,
+    load_canonicalizer,
+    train_canonicalizer,
+)
+from avatar.training.cycles import CycleConfig, CycleTrainer, find_code, rate_factor
+from avatar.training.logs import read_log
+
+TEMPLATE = arm_template()
+NETS = CanonicalizerConfig(SkinningFieldConfig(width=32, orders=4), SkinningFieldConfig(width=32, orders=4, latent=4))
+BENDS = (0.0, 0.5, 1.0, 1.5)
+SCANS = [prepare_scan(arm_frame(bend), TEMPLATE, 2000) for bend in BENDS]
+DRAW = DrawConfig(scan=64, body=64, edges=16, pool=2000)
+
+
+def make_trainer(folder, scans=SCANS, nets=NETS, **options) -> CycleTrainer:
+    torch.manual_seed(3)
+    defaults = {"first_steps": 6, "second_steps": 6, "batch": 2, "draw": DRAW, "log_every": 1, "save_every": 2}
+    model = Canonicalizer(TEMPLATE, len(scans), nets)
+    names = [f"bend.{i:05d}" for i in range(len(scans))]
+    return CycleTrainer(model, TEMPLATE, scans, names, CycleConfig(**(defaults | options)), folder)
+
+
+@pytest.mark.parametrize("stop", [3, 6, 7, 10], ids=["first stage", "between", "second stage", "late"])
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path, monkeypatch, stop):
+    whole = make_trainer(tmp_path / "whole")
+    whole.fit()
+
+    parts = make_trainer(tmp_path / "parts")
+    draw = parts.batch_at
+    monkeypatch.setattr(parts, "batch_at", lambda step: draw(step) if step < stop else 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        parts.fit()
+    again = make_trainer(tmp_path / "parts")
+    torch.rand(5)  # the random state on entry must not matter
+    again.fit()
+    assert again.step == 12
+    for name, value in whole.model.state_dict().items():
+        assert torch.equal(value, again.model.state_dict()[name]), name
+
+
+def test_log_names_every_term_and_the_cycle_only_where_it_is_learned(tmp_path):
+    make_trainer(tmp_path).fit()
+    rows = read_log(tmp_path / "metrics.csv")
+    assert [int(row["step"]) for row in rows] == list(range(1, 13))
+    for row in rows:
+        present = {term for term in TERMS if row[term]}
+        assert present == (set(TERMS) if int(row["step"]) > 6 else {"body", "nearest", "sparsity", "latent"})
+        assert all(math.isfinite(float(row[term])) for term in (*present, "loss", "grad_norm"))
+    rates = [float(row["lr"]) for row in rows]
+    assert rates == pytest.approx([4e-3] * 3 + [4e-4] * 2 + [4e-5] + [1e-3] * 3 + [1e-4] * 2 + [1e-5])
+
+
+def test_each_stage_has_an_optimiser_of_its_own(tmp_path):
+    trainer = make_trainer(tmp_path)
+    counts = []
+    for trainer.step in range(8):
+        trainer.train_step()
+        counts.append(int(trainer.optimiser.state[trainer.model.codes]["step"]))
+    assert counts == [1, 2, 3, 4, 5, 6, 1, 2]
+
+
+def test_every_scan_is_seen_once_an_epoch_in_an_order_that_changes(tmp_path):
+    trainer = make_trainer(tmp_path)
+    epochs = [[trainer.frame_at(4 * epoch + place) for place in range(4)] for epoch in range(6)]
+    assert all(sorted(epoch) == [0, 1, 2, 3] for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 1
+    assert torch.equal(trainer.batch_at(5).points, make_trainer(tmp_path).batch_at(5).points)
+    assert trainer.batch_at(3).frames.tolist() == [trainer.frame_at(6), trainer.frame_at(7)]
+
+
+def test_rates_fall_at_half_and_three_quarters():
+    assert [rate_factor(share) for share in (0, 0.49, 0.5, 0.74, 0.75, 1)] == pytest.approx(
+        [1, 1, 0.1, 0.1, 0.01, 0.01]
+    )
+
+
+def test_non_finite_losses_leave_the_weights_alone_and_end_training(tmp_path):
+    scans = [replace(scan, points=torch.full_like(scan.points, 1e30)) for scan in SCANS]
+    trainer = make_trainer(tmp_path, scans, first_steps=30)
+    before = {name: value.clone() for name, value in trainer.model.named_parameters()}
+    trainer.step = 30  # the second stage: points come back to nowhere
+    trainer.optimiser.state.clear()
+    with pytest.raises(AvatarError, match=r"not finite for 11 steps.*bend\.0000"):
+        for _ in range(20):
+            trainer.train_step()
+    assert all(torch.equal(value, before[name]) for name, value in trainer.model.named_parameters())
+
+
+def errors(frame, scan, posed_weights, canonical_weights) -> np.ndarray:
+    """Mean distances, metres, of a frame's points from where they come back to, and at rest from where they belong."""
+    points, transforms = to_root_frame(frame.scan.points, frame.body), scan.joint_transforms[None]
+    there = torch.linalg.inv(skin_transforms(posed_weights(points), transforms)[0])
+    canonical = transform_points(there, points)
+    back = transform_points(skin_transforms(canonical_weights(canonical), transforms)[0], canonical)
+    home = torch.from_numpy(frame.scan.canonical)
+    return np.array([float((ends[0] - ends[1]).norm(dim=1).mean()) for ends in ((back, points), (canonical, home))])
+
+
+@pytest.mark.slow
+def test_a_skirt_is_learned_better_than_the_nearest_leg_says_and_an_unseen_one_finds_its_code(tmp_path):
+    template = legs_template()
+    steps = [((0, 0.0), (0, 0.0)), ((0, 0.4), (0, -0.4)), ((-0.8, 0.1), (0.3, 0)), ((0.3, 0), (-0.8, -0.1))]
+    frames = [skirt_frame(*step) for step in (*steps, ((-0.5, 0.5), (0.2, -0.2)))]
+    scans = [prepare_scan(frame, template, 2000) for frame in frames]
+    torch.manual_seed(0)
+    model = Canonicalizer(template, 5, NETS)
+    config = CycleConfig(first_steps=150, second_steps=450, batch=5, draw=replace(DRAW, scan=128), code_steps=60)
+    CycleTrainer(model, template, scans, "abcde", config, tmp_path).fit()
+    model.requires_grad_(False)
+
+    def learned(frame, scan, code):
+        field = model.forward_field
+
+        def inverse(points):
+            return model.inverse(points[None], code[None], scan.box[None])[0]
+
+        return errors(frame, scan, inverse, lambda points: field(points[None])[0])
+
+    def nearest(frame, scan):
+        trees = (scan.body, template.vertices)
+        rivals = (lambda p, body=body: template.weights[torch.cdist(p, body).argmin(1)] for body in trees)
+        return errors(frame, scan, *rivals)
+
+    ours = np.mean([learned(frame, scan, code) for frame, scan, code in zip(frames, scans, model.codes)], axis=0)
+    theirs = np.mean([nearest(frame, scan) for frame, scan in zip(frames, scans)], axis=0)
+    assert ours[0] < 0.35 * theirs[0] and ours[1] < 0.7 * theirs[1], (ours, theirs)
+
+    frame = skirt_frame((-0.6, 0.2), (0.1, -0.3))
+    scan = prepare_scan(frame, template, 2000)
+    found = find_code(model, template, scan, model.codes[4], config)
+    before, after = learned(frame, scan, model.codes[4]), learned(frame, scan, found)
+    assert after[0] < 0.7 * before[0] and after[1] < before[1], (before, after)
+    assert torch.equal(found, find_code(model, template, scan, model.codes[4], config))
+
+
+def test_a_pose_needs_no_code_to_be_found():
+    torch.manual_seed(0)
+    model = Canonicalizer(TEMPLATE, 4, replace(NETS, latent=Latent.pose))
+    assert torch.equal(find_code(model, TEMPLATE, SCANS[2], model.codes[0], CycleConfig()), SCANS[2].pose)
+
+
+@pytest.fixture(scope="module")
+def settings(tiny_folder, tmp_path_factory) -> CanonicalizeConfig:
+    nets = CanonicalizerConfig(SkinningFieldConfig(width=16), SkinningFieldConfig(width=16, orders=8, latent=4))
+    draw = DrawConfig(scan=100, body=50, edges=20, pool=1000)
+    return CanonicalizeConfig(
+        dataset=tiny_folder.parent.name,
+        outfit=tiny_folder.name,
+        data_root=tiny_folder.parents[1],
+        runs_root=tmp_path_factory.mktemp("runs"),
+        scan=ScanConfig(points=3000, noise=0.0015),
+        canonicalizer=nets,
+        train=CycleConfig(first_steps=20, second_steps=20, batch=2, draw=draw, code_steps=5),
+        pictures=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(settings):
+    return canonicalize(settings)
+
+
+def test_a_run_has_its_scans_and_all_that_belongs_to_it(settings, folder, tiny_outfit):
+    assert folder == settings.runs_root / "canonical" / "open" / "tiny" / "default"
+    names = {"config.yaml", "metrics.csv", "checkpoints", "canonicalizer.safetensors", "canonicalizer.json"}
+    assert names | {"template.npz", "scans", "pictures"} <= {path.name for path in folder.iterdir()}
+    assert {path.name for path in (folder / "pictures").iterdir()} == {"train.png", "test.png"}
+    for split in ("train", "test"):
+        files = {path.name for path in (folder / "scans" / split).iterdir()}
+        expected = {f"{name}.npz" for name in tiny_outfit.frames(split)}
+        assert files == expected | ({name.replace(".npz", ".ply") for name in expected} if split == "train" else set())
+    scan = read_canonical_scan(folder / "scans" / "train" / f"{tiny_outfit.frames('train')[0]}.npz")
+    assert scan.weights.shape == (len(scan.points), 22) and scan.faces is None
+    cloud = read_points(folder / "scans" / "train" / f"{tiny_outfit.frames('train')[0]}.ply")
+    np.testing.assert_allclose(cloud.points, scan.points, atol=1e-6)
+
+
+def test_the_trained_field_comes_back_differentiable_and_frozen(settings, folder):
+    trained = load_canonicalizer(folder)
+    assert trained.config == settings and trained.steps == 40
+    points = trained.template.vertices[None, ::100].clone().requires_grad_()
+    weights = trained.forward_field(points)
+    weights[..., 3].sum().backward()
+    assert float(points.grad.abs().sum()) > 0
+    assert not any(parameter.requires_grad for parameter in trained.forward_field.parameters())
+
+
+def test_finished_scans_are_left_alone_and_damaged_or_outdated_ones_made_again(settings, folder, monkeypatch):
+    files = sorted((folder / "scans").rglob("*.npz"))
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+    monkeypatch.setattr(cycles.CycleTrainer, "fit", lambda self: pytest.fail("trained again"))
+    train_canonicalizer(settings)
+    canonicalize_frames(settings)
+    assert all(path.stat().st_mtime_ns == before[path][0] for path in files)
+    damaged = files[0]
+    damaged.write_bytes(before[damaged][1][:-30])
+    assert len(canonicalize_frames(settings)) == len(files)
+    assert damaged.read_bytes() == before[damaged][1]  # the same bits again
+    monkeypatch.setattr("avatar.training.canonicalizing.stamp_of", lambda config: "newer")
+    canonicalize_frames(settings)
+    assert {read_stamp(path) for path in files} == {"newer"}
+
+
+def test_going_on_with_other_settings_is_refused(settings, folder):
+    with pytest.raises(AvatarError, match=r"train\.first_lr.*another name"):
+        train_canonicalizer(replace(settings, train=replace(settings.train, first_lr=1.0)))
+
+
+def test_frames_without_a_pose_and_meshes_are_canonicalized_the_same(settings, folder, tiny_outfit):
+    trained, frame = load_canonicalizer(folder), tiny_outfit.load("test", tiny_outfit.frames("test")[1])
+    poseless = replace(frame, body=replace(frame.body, pose=None, vertex_transforms=None, pose_vertices=None))
+    points = frame.scan.points[::50]
+    assert np.array_equal(trained.weights_of(points, poseless), trained.weights_of(points, frame))
+    meshes = replace(settings, scan=ScanConfig(mesh=True, edge=0.05), weights=Skinning.nearest, name="mesh")
+    path = canonicalize_frames(replace(meshes, pictures=0))[0]
+    scan = read_canonical_scan(path)
+    assert scan.faces is not None and len(read_mesh(path.with_suffix(".ply")).faces) == len(scan.faces)
+
+
+@pytest.mark.parametrize("kind", [Skinning.nearest, Skinning.knn])
+def test_rivals_have_nothing_to_learn_and_no_field(settings, kind):
+    config = replace(settings, weights=kind, name=kind.value, pictures=0)
+    run = canonicalize(config)
+    assert not (run / "checkpoints").exists()
+    assert len(list((run / "scans").rglob("*.npz"))) == 9
+    with pytest.raises(DataError, match=r"no trained canonicalizer.*weights=learned"):
+        load_canonicalizer(run)
+
+
+def test_bad_settings_are_refused_by_name(settings):
+    for option in ({"name": "../x"}, {"stretch": 1.0}, {"pictures": -1}):
+        with pytest.raises(AvatarError, match=next(iter(option))):
+            replace(settings, **option)
+    for option in ({"first_steps": 0}, {"second_steps": -1}, {"clip": 0.0}, {"code_lr": 0.0}, {"batch": 0}):
+        with pytest.raises(AvatarError, match=next(iter(option))):
+            CycleConfig(**option)
+    with pytest.raises(AvatarError, match="pool"):
+        DrawConfig(pool=0)
+
+
+def test_each_joint_has_a_colour_of_its_own():
+    colors = weight_colors(np.eye(22))
+    assert colors.min() >= 0 and colors.max() <= 1
+    apart = np.linalg.norm(colors[:, None] - colors, axis=-1) + np.eye(22)
+    assert apart.min() > 0.05
+    np.testing.assert_allclose(weight_colors(np.eye(22)[:2].mean(0)[None])[0], colors[:2].mean(0))
