@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 import torch
 from torch import Tensor, nn
@@ -10,8 +11,12 @@ from torch.nn.functional import normalize
 
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.surface import interpolate, vertex_normals
+from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.nn.decoders import Decoded, DecoderConfig, ShapeDecoder
-from avatar.nn.pointnet2 import PointNet2, PointNet2Config
+from avatar.nn.encoders import Encoder, build_encoder
+from avatar.nn.locality import LocalPoseConfig, LocalPoseEncoder
+from avatar.nn.pointnet2 import PointNet2Config
+from avatar.nn.posing import LearnedSkinning
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
 FULL_GARMENT_ENCODER = {
@@ -25,6 +30,20 @@ FULL_GARMENT_ENCODER = {
     ),
     "propagation": ((128, 128), (128, 64), (64, 64), (64, 64), (64, 64), (64, 64)),
 }
+
+
+class Skinning(Enum):
+    """What carries the dressed surface from the canonical pose to a frame's."""
+
+    body = "body"  # CloSET: the transform of the skin an offset starts from
+    learned = "learned"  # SCANimate: a canonicalizer's field, asked at the offset point itself
+
+
+class PoseLocality(Enum):
+    """What a point's wrinkles may know of the pose."""
+
+    whole = "global"  # CloSET: PointNet++ over the posed body, whose coarse levels see all of it
+    kinematic = "kinematic"  # SCANimate: the joints near the point in the kinematic tree
 
 
 @dataclass
@@ -41,10 +60,19 @@ class ClosetConfig:
     template: bool = True  # explicit template decomposition (CloSET 3.2); False is the CSF ablation
     pose: bool = True  # the pose branch; False is the `static` floor: a garment template skinned by the body
     pose_noise: float = 0.0  # metres; noise on the pose encoder's input in training
+    pose_locality: PoseLocality = PoseLocality.whole
+    local_encoder: LocalPoseConfig = field(default_factory=LocalPoseConfig)  # instead of pose_encoder when kinematic
+    skinning: Skinning = Skinning.body
+    train_field: bool = False  # whether training moves the canonicalizer's field, too
+    encoder: Encoder = Encoder.pointnet2  # of both branches; conf/encoder/ has channels for each kind
 
     def __post_init__(self):
         if not (self.template or self.pose):
             raise AvatarError("template, pose: expected at least one branch, got neither.")
+        if self.pose_noise and self.pose_locality is PoseLocality.kinematic:
+            raise AvatarError("pose_noise: it is for the global pose encoder; set it to 0 with kinematic locality.")
+        if self.train_field and self.skinning is Skinning.body:
+            raise AvatarError("train_field: there is a field to train with skinning=learned only.")
         if self.code_channels < 1 or self.code_std < 0 or self.offset_scale <= 0 or self.pose_noise < 0:
             raise AvatarError(
                 "code_channels, offset_scale: expected positive values, code_std, pose_noise: not negative ones, "
@@ -63,17 +91,34 @@ class ClosetAvatar(nn.Module):
         """Builds the network on a body template for a number of outfits."""
         super().__init__()
         self.config = config
+        self.skinning: LearnedSkinning | None = None
         self.register_buffer("vertices", template.vertices.clone(), persistent=False)
         self.register_buffer("skin_normals", vertex_normals(template.vertices, template.faces), persistent=False)
         codes = torch.randn(outfits, len(template.vertices), config.code_channels) * config.code_std
         self.codes = nn.Parameter(codes)
-        self.garment_encoder = PointNet2(template, config.code_channels, config.garment_encoder)
+        self.garment_encoder = build_encoder(config.encoder, template, config.code_channels, config.garment_encoder)
         channels = self.garment_encoder.out_channels + 3
         if config.template:
             self.garment_decoder = ShapeDecoder(channels, config.garment_decoder)
         if config.pose:
-            self.pose_encoder = PointNet2(template, 3, config.pose_encoder)
+            if config.pose_locality is PoseLocality.kinematic:
+                self.pose_encoder = LocalPoseEncoder(template, config.local_encoder)
+            else:
+                self.pose_encoder = build_encoder(config.encoder, template, 3, config.pose_encoder)
             self.pose_decoder = ShapeDecoder(channels + self.pose_encoder.out_channels, config.pose_decoder)
+
+    def skin_with(self, skinning: LearnedSkinning) -> None:
+        """Gives a model with ``skinning=learned`` its outfits' fields; they are part of its state from then on.
+
+        Raises:
+            AvatarError: for a model skinned by the body, or fields of another number of outfits.
+        """
+        if self.config.skinning is not Skinning.learned:
+            raise AvatarError("skinning: this model is skinned by the body (skinning=body) and takes no fields.")
+        count = len(skinning.fields)
+        if count != len(self.codes):
+            raise AvatarError(f"fields: expected one for each of {len(self.codes)} outfits, got {count}.")
+        self.skinning = skinning
 
     def surface_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
         """Garment features and template position of each sample: ``(O, V, C)`` codes to ``(O, N, C' + 3)``."""
@@ -81,12 +126,14 @@ class ClosetAvatar(nn.Module):
         positions = interpolate(self.vertices, samples).expand(len(codes), -1, -1)
         return torch.cat([features, positions.to(features.dtype)], dim=-1)
 
-    def decode_wrinkles(self, pose_vertices: Tensor, garment: Tensor, samples: SurfaceSamples) -> Decoded:
-        """Pose branch: ``(B, V, 3)`` posed body and ``(B, N, C)`` surface features to wrinkle offsets and normals."""
+    def pose_features(self, batch: Batch, samples: SurfaceSamples) -> Tensor:
+        """What each sample knows of its frame's pose, ``(B, N, C)``."""
+        if self.config.pose_locality is PoseLocality.kinematic:
+            return self.pose_encoder(batch.joint_transforms, samples)
+        pose_vertices = batch.pose_vertices
         if self.training and self.config.pose_noise:
             pose_vertices = pose_vertices + torch.randn_like(pose_vertices) * self.config.pose_noise
-        pose = interpolate(self.pose_encoder(pose_vertices), samples)
-        return self.pose_decoder(torch.cat([pose, garment], dim=-1))
+        return interpolate(self.pose_encoder(pose_vertices), samples)
 
     def skin(self, samples: SurfaceSamples) -> Decoded:
         """The bare body, which both decoders correct: no offset, and the body's own normals ``(1, N, 3)``."""
@@ -102,7 +149,8 @@ class ClosetAvatar(nn.Module):
             wrinkles: False leaves the pose branch out: the garment template alone, skinned by the body.
 
         Returns:
-            `Prediction` with ``x = T r + p`` (CloSET 3.2), r = r^g + r^p in the body's local frame.
+            `Prediction` with ``x = T r + p`` (CloSET 3.2), r = r^g + r^p in the body's local frame; with learned
+            skinning ``x = T(w(c)) c``, c = p + r in the canonical pose.
         """
         check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=len(self.vertices))
         if not (wrinkles or self.config.template):
@@ -115,23 +163,43 @@ class ClosetAvatar(nn.Module):
             decoded = self.garment_decoder(garment)
             parts.append(Decoded(decoded.offsets[row], decoded.normals[row]))
         if self.config.pose and wrinkles:
-            parts.append(self.decode_wrinkles(batch.pose_vertices, garment[row], samples))
+            pose = self.pose_features(batch, samples)
+            parts.append(self.pose_decoder(torch.cat([pose, garment[row]], dim=-1)))
         local = sum(parts, self.skin(samples))
 
         scale = self.config.offset_scale
         offsets = (local.offsets * scale).float()
-        linear = interpolate(batch.vertex_transforms[..., :3, :3].flatten(-2), samples).unflatten(-1, (3, 3))
-        points = interpolate(batch.vertices, samples) + (linear @ offsets.unsqueeze(-1)).squeeze(-1)
-        normals = normalize((linear @ local.normals.float().unsqueeze(-1)).squeeze(-1), dim=-1)
+        posed = self.carry(Decoded(offsets, local.normals.float()), batch, samples)
         return Prediction(
-            points=points,
-            normals=normals,
+            points=posed.offsets,
+            normals=posed.normals,
             offsets=offsets,
             garment_offsets=parts[0].offsets.float() * scale if self.config.template else None,
             wrinkle_offsets=parts[-1].offsets.float() * scale if self.config.pose and wrinkles else None,
             wrinkle_normals=parts[-1].normals.float() if self.config.pose and wrinkles else None,
             codes=codes,
         )
+
+    def carry(self, local: Decoded, batch: Batch, samples: SurfaceSamples) -> Decoded:
+        """Offsets from the skin, in metres, and normals carried to the batch's bodies: posed points, unit normals.
+
+        In float32 whatever the network runs in: half precision is millimetres here.
+
+        Raises:
+            AvatarError: with learned skinning, before `skin_with` gave the model its fields.
+        """
+        with torch.autocast(local.offsets.device.type, enabled=False):
+            if self.config.skinning is Skinning.body or batch.canonical:
+                linear = interpolate(batch.vertex_transforms[..., :3, :3].flatten(-2), samples).unflatten(-1, (3, 3))
+                points = interpolate(batch.vertices, samples) + (linear @ local.offsets.unsqueeze(-1)).squeeze(-1)
+                normals = (linear @ local.normals.unsqueeze(-1)).squeeze(-1)
+                return Decoded(points, normalize(normals, dim=-1))
+            if self.skinning is None:
+                raise AvatarError("skinning: expected the fields of a canonicalizer (skin_with) before the first use.")
+            canonical = self.skinning.skin(batch.outfit_ids, samples) + local.offsets
+            transforms = self.skinning(canonical, batch.joint_transforms, batch.outfit_ids)
+            points = transform_points(transforms, canonical)
+            return Decoded(points, normalize(transform_directions(transforms, local.normals), dim=-1))
 
     @torch.no_grad()
     def garment_template(self, outfit: int, samples: SurfaceSamples) -> Decoded:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +22,30 @@ from avatar.data.outfits import SAFE_NAME, Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.io.npz import write_whole
+from avatar.nn.closet import Skinning
 from avatar.nn.methods import build_avatar, find_method
 from avatar.records import Batch, Template
 from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.training.canonical_runs import (
+    CANONICALIZERS,
+    canonical_outfits,
+    describe_fields,
+    learned_skinning,
+    rebuild_skinning,
+)
 from avatar.training.checkpoints import load_checkpoint, read_weights, write_weights
+from avatar.training.distributed import current_team
+from avatar.training.locks import lock_folder
 from avatar.training.loop import TrainConfig, Trainer
 
 WEIGHTS = "avatar"  # avatar.safetensors and avatar.json in the run's folder
+
+
+class Space(Enum):
+    """Where an avatar is compared with its scans in training; it predicts posed surfaces either way."""
+
+    posed = "posed"  # CloSET: with the scans as they are
+    canonical = "canonical"  # with the T-pose scans of the outfits' canonicalizers
 
 
 @dataclass
@@ -50,13 +69,18 @@ class RunConfig:
     runs_root: Path = Path("runs")
     scan: ScanConfig = field(default_factory=ScanConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
+    space: Space = Space.posed  # of the run, not the method: the network is the same
+    canonical: str = "default"  # name of the canonicalizers' runs, for space=canonical and learned skinning
     train: TrainConfig = field(default_factory=TrainConfig)
     device: str = "auto"  # auto takes CUDA where there is one
 
     def __post_init__(self):
-        for what, value in (("name", self.name), ("method.variant", self.method.variant)):
+        names = {"name": self.name, "method.variant": self.method.variant, "canonical": self.canonical}
+        for what, value in names.items():
             if not SAFE_NAME.fullmatch(value):
                 raise AvatarError(f"{what}: expected a plain name (letters, digits, '_', '.', '-'), got {value!r}.")
+        if self.method.variant == CANONICALIZERS:
+            raise AvatarError(f"method.variant: {CANONICALIZERS!r} is where canonicalizers are. Choose another name.")
         if not self.outfit or len(set(self.outfit)) != len(self.outfit):
             raise AvatarError(f"outfit: expected one or more different outfits, got {self.outfit}.")
 
@@ -105,29 +129,45 @@ def train_run(config: RunConfig) -> Path:
     template = mean_template([outfit.template for outfit in outfits])
     splits = [split_outfit(outfit, config.split) for outfit in outfits]
     scans, size = (config.train.scan_points, config.train.seed), config.train.batch
-    frames = FrameDataset(outfits, name_frames(outfits, "train", [s.train for s in splits]), *scans)
+    at_rest = config.space is Space.canonical
+    seen = canonical_outfits(config.runs_root, outfits, config.canonical) if at_rest else outfits
+    frames = FrameDataset(seen, name_frames(outfits, "train", [s.train for s in splits]), *scans)
     held_back = name_frames(outfits, "train", [s.validation for s in splits])
-    save_settings(config)
-
-    torch.manual_seed(config.train.seed)
-    model = build_avatar(config.method.name, template, len(outfits), settings).to(choose_device(config.device))
-    trainer = Trainer(model, template.vertices, template.faces, config.train, config.folder)
-    checks = FrameDataset(outfits, held_back, *scans) if held_back else None
-
+    checks = FrameDataset(seen, held_back, *scans) if held_back else None
+    model = fresh_avatar(config, settings, template, outfits)
     symmetry = mirror_map(template) if config.train.mirror else None
+    team = current_team()
+    share = team.share(size)
 
     def batch_at(step: int) -> Batch:
-        batch = frames.batch_at(step, size)
-        return batch if symmetry is None else mirror_batch(batch, mirror_coins(config.train.seed, step, size), symmetry)
+        batch = replace(frames.batch_at(step * team.size + team.rank, size // team.size), canonical=at_rest)
+        coins = mirror_coins(config.train.seed, step, size)[share]
+        return batch if symmetry is None else mirror_batch(batch, coins, symmetry)
 
     def validation() -> Iterator[Batch]:
-        return checks.ordered_batches(size) if checks else iter(())
+        return (replace(batch, canonical=at_rest) for batch in checks.ordered_batches(size)) if checks else iter(())
 
-    trainer.fit(batch_at, frames.epoch_length(size), validation)
-    write_template(config.folder / "template.npz", template)
-    facts = {"config": settings_to_dict(config), "steps": trainer.step, "seconds": trainer.seconds}
-    write_weights(config.folder / WEIGHTS, model.state_dict(), facts)
+    with lock_folder(config.folder) if team.leads else nullcontext():
+        if team.leads:
+            save_settings(config)
+        trainer = Trainer(model, template.vertices, template.faces, config.train, config.folder)
+        trainer.fit(batch_at, frames.epoch_length(size), validation)
+        if team.leads:
+            write_template(config.folder / "template.npz", template)
+            facts = {"config": settings_to_dict(config), "steps": trainer.step, "seconds": trainer.seconds}
+            if takes_fields(settings):
+                facts["fields"] = describe_fields(model.skinning)
+            write_weights(config.folder / WEIGHTS, model.state_dict(), facts)
     return config.folder
+
+
+def fresh_avatar(config: RunConfig, settings: Any, template: Template, outfits: list[Outfit]) -> nn.Module:
+    """The untrained network of a run on its device, with its canonicalizers' fields where it is skinned by them."""
+    torch.manual_seed(config.train.seed)
+    model = build_avatar(config.method.name, template, len(outfits), settings)
+    if takes_fields(settings):
+        model.skin_with(learned_skinning(config.runs_root, outfits, config.canonical, settings.train_field))
+    return model.to(choose_device(config.device))
 
 
 def save_settings(config: RunConfig) -> None:
@@ -172,6 +212,11 @@ def mean_template(templates: list[Template]) -> Template:
     return replace(first, vertices=vertices, joints=joints)
 
 
+def takes_fields(settings: Any) -> bool:
+    """Whether a method's settings ask for the skinning fields of canonicalizers."""
+    return getattr(settings, "skinning", Skinning.body) is Skinning.learned
+
+
 def load_run(folder: Path, checkpoint: str = "last", device: str = "auto") -> TrainedAvatar:
     """The trained avatar of a run's folder.
 
@@ -196,5 +241,7 @@ def load_run(folder: Path, checkpoint: str = "last", device: str = "auto") -> Tr
     template = read_template(folder / "template.npz")
     settings = settings_from_dict(find_method(config.method.name).settings, config.method.settings)
     model = build_avatar(config.method.name, template, len(config.outfit), settings)
+    if takes_fields(settings):
+        model.skin_with(rebuild_skinning(facts["fields"], template))
     model.load_state_dict(weights)
     return TrainedAvatar(model.to(choose_device(device)).eval(), template, config, steps, seconds)

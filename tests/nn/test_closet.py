@@ -1,14 +1,26 @@
 """CloSET's network: its equations, its switches and its invariances, on a small body."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from spheres import DECODER, TEMPLATE, random_batch, small_config
+from wearers import BodyField, SmoothField, posed_batch, vertex_samples
 
+from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.nn.closet import ClosetAvatar
+from avatar.geometry.transforms import transform_directions, transform_points
+from avatar.nn.closet import ClosetAvatar, PoseLocality, Skinning
+from avatar.nn.decoders import Decoded
+from avatar.nn.hierarchy import HierarchyConfig
+from avatar.nn.locality import LocalPoseConfig
 from avatar.nn.methods import build_avatar, find_method
+from avatar.nn.pointnet2 import PointNet2Config
+from avatar.nn.posing import LearnedSkinning
 from avatar.records import Batch
+
+LOCAL = {"pose_locality": PoseLocality.kinematic, "local_encoder": LocalPoseConfig(widths=(8, 4))}
 
 
 def template_points(count: int = 200):
@@ -18,6 +30,20 @@ def template_points(count: int = 200):
 def avatar(**switches) -> ClosetAvatar:
     torch.manual_seed(0)
     return ClosetAvatar(TEMPLATE, 2, small_config(**switches)).eval()
+
+
+def frames_of(batch: Batch, chosen: slice) -> Batch:
+    tensors = {key: value for key, value in vars(batch).items() if isinstance(value, torch.Tensor)}
+    return replace(batch, **{key: value[chosen] for key, value in tensors.items()}, names=batch.names[chosen])
+
+
+def silence(model: ClosetAvatar) -> ClosetAvatar:
+    """The model with decoders that say nothing."""
+    for decoder in (model.garment_decoder, model.pose_decoder):
+        for branch in (decoder.offset_branch, decoder.normal_branch):
+            torch.nn.init.zeros_(branch[-1].weight)
+            torch.nn.init.zeros_(branch[-1].bias)
+    return model
 
 
 def test_points_are_the_transformed_offset_on_the_posed_body():
@@ -85,7 +111,7 @@ def test_point_count_is_free_and_points_are_independent():
 def test_frames_do_not_see_each_other():
     batch, samples = random_batch(), template_points()
     model = avatar()
-    alone = Batch(**{k: v[:1] for k, v in vars(batch).items()})
+    alone = frames_of(batch, slice(1))
     torch.testing.assert_close(model(alone, samples).points, model(batch, samples).points[:1], rtol=1e-5, atol=1e-5)
 
 
@@ -115,13 +141,138 @@ def test_registry_names_its_methods():
 
 def test_without_offsets_the_prediction_is_the_bare_body_with_its_normals():
     batch, samples = random_batch(), template_points()
-    model = avatar()
-    for decoder in (model.garment_decoder, model.pose_decoder):
-        for branch in (decoder.offset_branch, decoder.normal_branch):
-            torch.nn.init.zeros_(branch[-1].weight)
-            torch.nn.init.zeros_(branch[-1].bias)
-    prediction = model(batch, samples)
+    prediction = silence(avatar())(batch, samples)
     torch.testing.assert_close(prediction.points, interpolate(batch.vertices, samples))
     skin = interpolate(TEMPLATE.vertices, samples)  # a sphere's normals point as its points do
     expected = torch.nn.functional.normalize(skin @ batch.vertex_transforms[:, 0, :3, :3].transpose(1, 2), dim=-1)
     assert ((prediction.normals * expected).sum(dim=-1) > 0.98).all()
+
+
+def dressed(body, fields, **switches) -> ClosetAvatar:
+    """A small avatar on the open body, skinned by fields."""
+    torch.manual_seed(0)
+    model = ClosetAvatar(body.template, len(fields), small_config(skinning=Skinning.learned, **switches)).eval()
+    model.skin_with(LearnedSkinning(fields, [body.template] * len(fields), model.config.train_field))
+    return model
+
+
+def test_with_the_bodys_own_field_and_no_offset_learned_skinning_is_the_bodys():
+    body, samples = open_body("female"), vertex_samples(torch.arange(0, 12272, 17))
+    batch = posed_batch([body], [0, 0])
+    learned = silence(dressed(body, [BodyField(body.template)]))
+    by_body = silence(ClosetAvatar(body.template, 1, small_config()).eval())
+    expected, found = by_body(batch, samples), learned(batch, samples)
+    torch.testing.assert_close(found.points, expected.points, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.normals, expected.normals, atol=1e-4, rtol=0)
+
+
+def test_the_field_is_asked_at_the_offset_point_and_moves_points_and_normals():
+    body, samples = open_body("female"), vertex_samples(torch.arange(0, 12272, 500))
+    batch, fields = posed_batch([body], [0, 0]), [SmoothField(22), SmoothField(22)]
+    batch = replace(batch, outfit_ids=torch.tensor([1, 0]))
+    model = dressed(body, fields, offset_scale=0.5)
+    prediction = model(batch, samples)
+    resting = interpolate(body.template.vertices, samples) + prediction.offsets
+    transforms = model.skinning(resting, batch.joint_transforms, batch.outfit_ids)
+    torch.testing.assert_close(prediction.points, transform_points(transforms, resting))
+    local = model(
+        replace(batch, canonical=True, vertex_transforms=torch.eye(4).expand(2, 12272, 4, 4)), samples
+    ).normals
+    turned = torch.nn.functional.normalize(transform_directions(transforms, local), dim=-1)
+    torch.testing.assert_close(prediction.normals, turned, atol=1e-5, rtol=0)
+    skin = interpolate(body.template.vertices, samples).expand(2, -1, -1)
+    elsewhere = model.skinning(skin, batch.joint_transforms, batch.outfit_ids)
+    assert (transform_points(elsewhere, resting) - prediction.points).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("train_field", [True, False])
+def test_learned_skinning_teaches_offsets_and_its_fields_when_asked(train_field):
+    body, samples = open_body("female"), vertex_samples(torch.arange(0, 12272, 100))
+    model = dressed(body, [SmoothField(22)], train_field=train_field).train()
+    model(posed_batch([body], [0, 0]), samples).points.square().sum().backward()
+    missing = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
+    silent = [name for name in missing if "normal_branch" not in name]
+    assert silent == ([] if train_field else ["skinning.fields.0.layer.weight", "skinning.fields.0.layer.bias"])
+
+
+def test_canonical_batches_are_left_at_rest():
+    body, samples = open_body("female"), vertex_samples(torch.arange(0, 12272, 100))
+    resting = body.template.vertices.expand(2, -1, -1)
+    batch = replace(
+        posed_batch([body], [0, 0]),
+        vertices=resting,
+        vertex_transforms=torch.eye(4).expand(2, 12272, 4, 4),
+        canonical=True,
+    )
+    prediction = dressed(body, [SmoothField(22)])(batch, samples)
+    torch.testing.assert_close(prediction.points, interpolate(resting, samples) + prediction.offsets)
+    assert (prediction.wrinkle_offsets[0] - prediction.wrinkle_offsets[1]).abs().max() > 0  # still told the pose
+
+
+@pytest.mark.parametrize("skinning", ["body", "learned"])
+def test_half_precision_ends_before_posing(skinning):
+    body, samples = open_body("female"), vertex_samples(torch.arange(0, 12272, 100))
+    batch, scale = posed_batch([body], [0]), {"offset_scale": 5.0}  # offsets of decimetres, so that rounding shows
+    torch.manual_seed(0)
+    by_body = ClosetAvatar(body.template, 1, small_config(**scale, **LOCAL)).eval()
+    model = by_body if skinning == "body" else dressed(body, [SmoothField(22)], **scale)
+    with torch.autocast("cpu", torch.bfloat16):
+        prediction = model(batch, samples)
+    again = model.carry(Decoded(prediction.offsets, prediction.offsets), batch, samples)
+    torch.testing.assert_close(prediction.points, again.offsets, atol=1e-6, rtol=0)
+
+
+def test_a_turned_wrist_is_felt_at_the_foot_by_the_global_encoder_only():
+    body = open_body("female")
+    template, pose = body.template, torch.zeros(2, 22, 3)
+    wrist, foot = (template.joint_names.index(name) for name in ("left_wrist", "right_foot"))
+    pose[1, wrist] = torch.tensor([0.0, 0.5, 0.8])
+    posed = body(pose)
+    batch = replace(
+        posed_batch([body], [0, 0]),
+        pose_vertices=posed.vertices,
+        vertices=posed.vertices,
+        vertex_transforms=posed.vertex_transforms,
+        joint_transforms=posed.joint_transforms,
+    )
+    samples = sample_surface(template.vertices, template.faces, 4000, torch.Generator().manual_seed(0))
+    on_foot, on_hand = (interpolate(template.weights[:, [joint]], samples)[:, 0] > 0.5 for joint in (foot, wrist))
+    reaching = PointNet2Config(HierarchyConfig((64, 4), (0.5, 3.0), 64), ((8,), (8,)), ((8,), (4,)))
+
+    @torch.no_grad()
+    def felt(where: torch.Tensor, **switches) -> tuple[float, float]:
+        torch.manual_seed(0)
+        model = ClosetAvatar(template, 1, replace(small_config(**switches), pose_encoder=reaching)).eval()
+        prediction = model(batch, samples)
+        moved = ((value[1] - value[0])[where] for value in (prediction.points, prediction.wrinkle_offsets))
+        return tuple(float(change.abs().max()) for change in moved)
+
+    assert felt(on_foot, **LOCAL) == (0.0, 0.0)  # to the bit
+    assert felt(on_hand, **LOCAL)[1] > 1e-6
+    assert felt(on_foot)[0] > 0
+
+
+def test_kinematic_locality_needs_the_joints_alone():
+    body, samples = open_body("female"), vertex_samples(torch.arange(0, 12272, 100))
+    batch = posed_batch([body], [0])
+    torch.manual_seed(0)
+    model = ClosetAvatar(body.template, 1, small_config(**LOCAL)).eval()
+    blind = replace(batch, pose_vertices=torch.zeros_like(batch.pose_vertices))
+    torch.testing.assert_close(model(blind, samples).points, model(batch, samples).points, rtol=0, atol=0)
+    with pytest.raises(AvatarError, match="two joints or more"):
+        avatar(**LOCAL)  # the sphere has one
+
+
+def test_switches_that_do_not_go_together_are_refused():
+    with pytest.raises(AvatarError, match=r"pose_noise.*kinematic"):
+        small_config(pose_noise=0.1, **LOCAL)
+    with pytest.raises(AvatarError, match=r"train_field.*skinning=learned"):
+        small_config(train_field=True)
+    fields = LearnedSkinning([torch.nn.Identity()], [TEMPLATE])
+    with pytest.raises(AvatarError, match="skinned by the body"):
+        avatar().skin_with(fields)
+    learned = avatar(skinning=Skinning.learned)
+    with pytest.raises(AvatarError, match="one for each of 2 outfits, got 1"):
+        learned.skin_with(fields)
+    with pytest.raises(AvatarError, match=r"fields of a canonicalizer \(skin_with\)"):
+        learned(random_batch(), template_points())

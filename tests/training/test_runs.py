@@ -45,7 +45,7 @@ def held_out_error(folder, outfit) -> float:
     errors = []
     for name in outfit.frames("test"):
         frame = outfit.load("test", name)
-        samples = template_samples(avatar.template, 8000)
+        samples = template_samples(avatar, 8000)
         cloud = predict(avatar.model, body_batch([frame.body], 0, (name,)), samples)
         floor = distance(outfit.resample("test", name, 8000, 1).points, frame.scan.points)
         errors.append(distance(cloud.points, frame.scan.points) - floor)

@@ -1,0 +1,111 @@
+"""Local pose conditioning (SCANimate 3.2): a point of the surface sees only the joints near it in the kinematic tree.
+
+A hierarchy over the surface passes every joint's motion to every point in its coarse levels. Here the pose features
+are a function of the point alone: where it is, and the joints it may see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import roma
+import torch
+from torch import Tensor, nn
+
+from avatar.checks import AvatarError, check_shape
+from avatar.geometry.surface import interpolate
+from avatar.nn.pointnet2 import PointNorm, point_mlp
+from avatar.records import SurfaceSamples, Template
+
+
+@dataclass
+class LocalPoseConfig:
+    """Reach and size of a local pose encoder; the defaults cost about what the full global one does."""
+
+    rings: int = 4  # steps in the kinematic tree that a joint's motion reaches (the paper's); 11 is everywhere
+    widths: tuple[int, ...] = (512, 512, 512, 64)  # channels of its layers; the last ones are the features
+    orders: int = 6  # Fourier orders of the position on the template
+
+    def __post_init__(self):
+        self.widths = tuple(self.widths)
+        if self.rings < 0 or self.orders < 0 or not self.widths or min(self.widths) < 1:
+            raise AvatarError(
+                "rings, orders: expected at least 0, widths: one or more positive numbers of channels, "
+                f"got {self.rings}, {self.orders} and {self.widths}."
+            )
+
+
+def tree_distances(parents: tuple[int, ...]) -> Tensor:
+    """Steps between each two joints along the kinematic tree, ``(J, J)`` int64."""
+    steps = torch.full((len(parents), len(parents)), len(parents))
+    for joint, parent in enumerate(parents):
+        if joint:  # as far from what is already there as its parent, and one more
+            steps[joint, :joint] = steps[:joint, joint] = steps[parent, :joint] + 1
+        steps[joint, joint] = 0
+    return steps
+
+
+def pose_gates(template: Template, rings: int) -> Tensor:
+    """How much each vertex sees of each joint but the root, ``(V, J - 1)`` in [0, 1]: SCANimate's W w (eq. 18).
+
+    1 where all the joints that move the vertex are within ``rings`` steps of the joint, 0 where none is.
+    """
+    near = tree_distances(template.parents)[:, 1:] <= rings
+    return template.weights @ near.to(template.weights)
+
+
+def relative_rotations(joint_transforms: Tensor, parents: tuple[int, ...]) -> Tensor:
+    """Rotation of each joint but the root relative to its parent, as a quaternion less that of rest.
+
+    Needs no pose parameters and does not change with the body's place and heading. Of the two quaternions of a
+    rotation it is the one with a positive real part (x, y, z, w - 1), so that the canonical pose is all zeros.
+
+    Args:
+        joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
+        parents: J indices, -1 for the root.
+
+    Returns:
+        ``(B, J - 1, 4)``.
+    """
+    check_shape("joint_transforms", joint_transforms, "B J 4 4", J=len(parents))
+    rotations = joint_transforms[..., :3, :3]
+    relative = rotations[:, list(parents[1:])].transpose(-1, -2) @ rotations[:, 1:]
+    quaternions = roma.rotmat_to_unitquat(relative)
+    quaternions = torch.where(quaternions[..., 3:] < 0, -quaternions, quaternions)
+    return quaternions - quaternions.new_tensor([0.0, 0.0, 0.0, 1.0])
+
+
+class LocalPoseEncoder(nn.Module):
+    """Pose features of points on the template: a network on (W w) o theta and the position (SCANimate eq. 18).
+
+    The first layer is linear in the gated rotations, so each joint goes through it once a frame and is gated
+    afterwards: sum_j W_j (g_j theta_j) = sum_j g_j (W_j theta_j), exactly.
+    """
+
+    def __init__(self, template: Template, config: LocalPoseConfig):
+        """Builds the encoder for one template; needs two joints or more."""
+        super().__init__()
+        if len(template.parents) < 2:
+            raise AvatarError("template: expected two joints or more for local pose conditioning, got one.")
+        self.parents, self.orders, self.out_channels = template.parents, config.orders, config.widths[-1]
+        self.register_buffer("gates", pose_gates(template, config.rings), persistent=False)
+        self.register_buffer("vertices", template.vertices.clone(), persistent=False)
+        self.pose_layer = nn.Linear(4 * (len(template.parents) - 1), config.widths[0])
+        self.position_layer = nn.Linear(3 + 6 * config.orders, config.widths[0], bias=False)
+        self.first = nn.Sequential(PointNorm(config.widths[0]), nn.ReLU())
+        self.rest = point_mlp(config.widths)
+
+    def forward(self, joint_transforms: Tensor, samples: SurfaceSamples) -> Tensor:
+        """``(B, J, 4, 4)`` posed_from_canonical to features ``(B, N, C)`` of N points on the template."""
+        rotations = relative_rotations(joint_transforms, self.parents)
+        columns = self.pose_layer.weight.unflatten(1, rotations.shape[1:])
+        joints = torch.einsum("bjq,cjq->bjc", rotations, columns)
+        places = self.position_layer(fourier_features(interpolate(self.vertices, samples), self.orders))
+        lifted = interpolate(self.gates, samples) @ joints + places + self.pose_layer.bias
+        return self.rest(self.first(lifted))
+
+
+def fourier_features(points: Tensor, orders: int) -> Tensor:
+    """Points ``(..., 3)`` in metres, and sin and cos of 2^k pi of them: ``(..., 3 + 6 orders)``."""
+    waves = [wave(2**order * torch.pi * points) for order in range(orders) for wave in (torch.sin, torch.cos)]
+    return torch.cat([points, *waves], dim=-1)

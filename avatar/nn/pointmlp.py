@@ -1,0 +1,111 @@
+"""PointMLP (ICLR 2022) on a constant template: residual point networks on neighbourhoods in a common scale."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import relu
+
+from avatar.checks import check_shape
+from avatar.geometry.neighbours import k_nearest
+from avatar.nn.hierarchy import Level, build_levels
+from avatar.nn.pointnet2 import FeaturePropagation, PointNet2Config, PointNorm
+from avatar.records import Template
+
+
+class GeometricAffine(nn.Module):
+    """Brings all neighbourhoods of a cloud to one scale: a (f_ij - f_i) / (sigma + e) + b, a and b learned (eq. 5).
+
+    sigma is one number a cloud: the root mean square of all its neighbours' differences.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.alpha = nn.Parameter(torch.ones(channels))
+        self.beta = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, grouped: Tensor, centres: Tensor) -> Tensor:
+        """``(B, S, K, C)`` neighbours and ``(B, S, C)`` centres to ``(B, S, K, C)``."""
+        difference = grouped - centres.unsqueeze(2)
+        sigma = (difference.float().square().mean(dim=(1, 2, 3), keepdim=True) + 1e-12).sqrt()
+        return self.alpha * difference / (sigma + 1e-5) + self.beta
+
+
+class ResidualPointMLP(nn.Module):
+    """Two layers around a narrow middle, added to what came in (eq. 4's residual blocks); on the last dimension."""
+
+    def __init__(self, width: int, inner: int):
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(width, inner), PointNorm(inner), nn.ReLU(), nn.Linear(inner, width), PointNorm(width)
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(..., C)`` to ``(..., C)``."""
+        return relu(features + self.layers(features))
+
+
+class PointMLPLevel(nn.Module):
+    """One stage: affine neighbourhoods, residual blocks, maximum over the neighbours, residual blocks (eq. 4).
+
+    The neighbours' differences alone would not tell what is at the centre, so its own feature is joined to them; the
+    layer that takes both is linear, and applied to a centre once.
+    """
+
+    def __init__(self, level: Level, channels: int, widths: tuple[int, ...]):
+        """Builds the stage; ``widths`` are the inner widths of its residual blocks, then its own width."""
+        super().__init__()
+        *inner, width = widths
+        self.level = level
+        own = k_nearest(level.positions[None], level.finer_positions[None], 1)[0, :, 0]
+        self.register_buffer("own", own, persistent=False)  # each centre in the finer level
+        self.affine = GeometricAffine(channels + 3)
+        self.difference_layer = nn.Linear(channels + 3, width, bias=False)
+        self.centre_layer = nn.Linear(channels + 3, width)
+        self.norm = PointNorm(width)
+        self.before = nn.Sequential(*(ResidualPointMLP(width, narrow) for narrow in inner))
+        self.after = nn.Sequential(*(ResidualPointMLP(width, narrow) for narrow in inner))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(B, N, C)`` features of the finer level to ``(B, S, C')`` of the coarser."""
+        positions = self.level.finer_positions.to(features.dtype).expand(len(features), -1, -1)
+        joined = torch.cat([features, positions], dim=-1)
+        centres = joined[:, self.own]
+        grouped = self.difference_layer(self.affine(joined[:, self.level.groups], centres))
+        lifted = relu(self.norm(grouped + self.centre_layer(centres).unsqueeze(2)))
+        return self.after(self.before(lifted).amax(dim=2))
+
+
+class PointMLP(nn.Module):
+    """PointMLP in the place of PointNet++: features on the template's vertices to one vector for each of them.
+
+    It takes the settings of PointNet++ and reads a level's channels as the inner widths of its residual blocks
+    (before and after the maximum alike) followed by its width. Neighbours are PointNet++'s balls, not the paper's k
+    nearest, and the way back up is PointNet++'s feature propagation.
+    """
+
+    def __init__(self, template: Template, channels: int, config: PointNet2Config):
+        """Builds the encoder for one template and ``channels`` input features a vertex."""
+        super().__init__()
+        self.channels = channels
+        self.out_channels = config.propagation[-1][-1]
+        levels = build_levels(template.vertices, config.hierarchy)
+        self.stages, widths = nn.ModuleList(), [channels]
+        for level, widths_here in zip(levels, config.abstraction):
+            self.stages.append(PointMLPLevel(level, widths[-1], widths_here))
+            widths.append(widths_here[-1])
+        self.propagations, coarse = nn.ModuleList(), widths.pop()
+        for level, mlp in zip(reversed(levels), config.propagation):
+            self.propagations.append(FeaturePropagation(level, coarse, widths.pop(), mlp))
+            coarse = mlp[-1]
+
+    def forward(self, features: Tensor) -> Tensor:
+        """``(B, V, C)`` features on the template's vertices to ``(B, V, C')``."""
+        check_shape("features", features, "B V C", C=self.channels)
+        pyramid = [features]
+        for stage in self.stages:
+            pyramid.append(stage(pyramid[-1]))
+        coarse = pyramid.pop()
+        for propagation in self.propagations:
+            coarse = propagation(coarse, pyramid.pop())
+        return coarse
