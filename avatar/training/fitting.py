@@ -17,7 +17,7 @@ from avatar.records import Batch
 from avatar.settings import settings_to_dict
 from avatar.training.checkpoints import write_weights
 from avatar.training.losses import LossConfig, point_avatar_loss
-from avatar.training.runs import WEIGHTS, TrainedAvatar, load_run, save_settings
+from avatar.training.runs import WEIGHTS, TrainedAvatar, load_run, save_settings, takes_fields
 
 
 @dataclass
@@ -47,6 +47,11 @@ class FitConfig:
 def fit_outfit(config: FitConfig) -> Path:
     """Fits the outfit and leaves a run folder like that of training, with the new outfit as its only one."""
     avatar = load_run(config.run, device=config.device)
+    if takes_fields(avatar.model.config):
+        raise AvatarError(
+            "run: learned skinning belongs to the outfits it was trained on. Canonicalize and train the new one, or "
+            "fit a run with skinning=body."
+        )
     outfit = find_outfit(config.data_root, config.dataset, config.outfit, avatar.config.scan)
     if not torch.equal(outfit.template.faces, avatar.template.faces):
         raise AvatarError(f"outfit: {outfit.name} has a body of another topology than {config.run} was trained on.")

@@ -71,7 +71,7 @@ def test_unsound_scans_are_not_written(tmp_path, change, message):
     ("change", "message"),
     [
         ({"format": np.array("canonical-scan/9")}, "expected format canonical-scan/1"),
-        ({"weights": np.zeros((60, 5), np.uint16)}, "summing to 1"),
+        ({"weights": np.zeros((5, 60), np.uint16)}, "summing to 1"),
         ({"normals": np.zeros((60, 3), np.float32)}, "unit normals"),
         ({"source": np.arange(60)[::-1].astype(np.int32)}, "rising"),
         ({"faces": np.array([[0, 1, 99]], np.int32)}, "faces"),
@@ -87,7 +87,7 @@ def test_unsound_files_are_refused_by_name(tmp_path, change, message):
         "stamp": "text ",
         "points": "float M 3",
         "normals": "float M 3",
-        "weights": "uint16 M J",
+        "weights": "uint16 J M",
         "source": "int M",
     }
     arrays = read_arrays(path, keys) | change

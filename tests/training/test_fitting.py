@@ -9,8 +9,9 @@ from spheres import TEMPLATE, random_batch, small_config
 
 from avatar.checks import AvatarError
 from avatar.geometry.surface import sample_surface
-from avatar.nn.closet import ClosetAvatar
-from avatar.training.fitting import FitConfig, fit_code
+from avatar.nn.closet import ClosetAvatar, Skinning
+from avatar.training import fitting
+from avatar.training.fitting import FitConfig, fit_code, fit_outfit
 from avatar.training.losses import LossConfig, point_avatar_loss
 from avatar.training.runs import RunConfig, TrainedAvatar
 
@@ -39,6 +40,14 @@ def test_only_the_code_is_learned_and_it_fits_the_scan():
     model.codes.data = mean.data
     assert fitted < 0.5 * distance()
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items() if name != "codes")
+
+
+def test_another_wearer_s_field_is_not_fitted(monkeypatch):
+    model = ClosetAvatar(TEMPLATE, 1, small_config(skinning=Skinning.learned))
+    avatar = TrainedAvatar(model, TEMPLATE, RunConfig(), 0, 0.0)
+    monkeypatch.setattr(fitting, "load_run", lambda *_, **__: avatar)
+    with pytest.raises(AvatarError, match="skinning=body"):
+        fit_outfit(FitConfig())
 
 
 def test_bad_options_are_refused():
