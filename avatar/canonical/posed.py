@@ -13,7 +13,7 @@ from avatar.body.skinning import skin_transforms
 from avatar.canonical.edges import nearest_ids, smooth_edges
 from avatar.canonical.fields import bounding_box
 from avatar.checks import AvatarError
-from avatar.geometry.surface import interpolate, sample_surface
+from avatar.geometry.surface import face_areas, interpolate, sample_surface
 from avatar.geometry.transforms import axis_angle_from_rotation, invert_affine, transform_points
 from avatar.records import BodyFit, Frame, Scan, Template
 
@@ -24,7 +24,8 @@ class PosedScan:
 
     ``points (M, 3)``; ``nearest (M,)`` the body vertex nearest to each; ``edges (E, 2, 3)`` ends of the scan's edges
     outside concave regions; ``body (V, 3)``; ``canonical_body (V, 3)`` with the pose blendshapes of this pose, where
-    the body has them; ``joint_transforms (J, 4, 4)`` posed_from_canonical; ``pose (3 (J - 1),)`` axis-angle without
+    the body has them; ``vertices (P,)`` indices of body vertices in proportion to their areas, for faces and fingers
+    have more than their share; ``joint_transforms (J, 4, 4)`` posed_from_canonical; ``pose (3 (J - 1),)`` axis-angle without
     the root's; ``box (2, 3)`` around the posed body.
     """
 
@@ -33,6 +34,7 @@ class PosedScan:
     edges: Tensor
     body: Tensor
     canonical_body: Tensor
+    vertices: Tensor
     joint_transforms: Tensor
     pose: Tensor
     box: Tensor
@@ -70,7 +72,7 @@ class DrawConfig:
     scan: int = 8000
     body: int = 6890  # body vertices; all of SMPL's
     edges: int = 5000
-    pool: int = 50_000  # scan points and edges of a frame that are kept in memory to draw from
+    pool: int = 50_000  # scan points, edges and body vertices of a frame kept in memory to draw from
 
     def __post_init__(self):
         wrong = {name: value for name, value in vars(self).items() if value < 1}
@@ -122,10 +124,18 @@ def prepare_scan(frame: Frame, template: Template, pool: int, seed: int = 0) -> 
         edges=to_root_frame(frame.scan.points[edges].reshape(-1, 3), frame.body).reshape(-1, 2, 3),
         body=body,
         canonical_body=transform_points(back, body),
+        vertices=torch.from_numpy(rng.choice(len(body), pool, p=area_shares(body, template.faces))),
         joint_transforms=transforms,
         pose=local_pose(transforms, template.parents),
         box=bounding_box(body),
     )
+
+
+def area_shares(vertices: Tensor, faces: Tensor) -> np.ndarray:
+    """Each vertex's share ``(V,)`` of a surface's area: a third of the triangles around it."""
+    areas = face_areas(vertices, faces).double()
+    shares = areas.new_zeros(len(vertices)).index_add(0, faces.reshape(-1), areas.repeat_interleave(3))
+    return (shares / shares.sum()).numpy()
 
 
 def draw_surface(scan: Scan, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -151,10 +161,11 @@ def draw_batch(
     """
     items = []
     for scan in (scans[frame] for frame in frames):
-        point, edge, vertex = (
+        point, edge, chosen = (
             torch.randint(len(pool), (count,), generator=generator)
-            for pool, count in ((scan.points, draw.scan), (scan.edges, draw.edges), (scan.body, draw.body))
+            for pool, count in ((scan.points, draw.scan), (scan.edges, draw.edges), (scan.vertices, draw.body))
         )
+        vertex = scan.vertices[chosen]
         items.append(
             {
                 "points": scan.points[point],

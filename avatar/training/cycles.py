@@ -34,8 +34,9 @@ class CycleConfig:
     first_steps: int = 10_000  # optimiser steps with the fields apart
     second_steps: int = 25_000  # and together
     batch: int = 4  # frames a step
-    first_lr: float = 0.004  # falls to a tenth at half and again at three quarters of each stage
+    first_lr: float = 0.004
     second_lr: float = 0.001
+    decay: float = 0.1  # factor on both at half, and again at three quarters, of each stage
     clip: float | None = None  # largest gradient norm
     code_steps: int = 200  # to find the code of a frame that was not learned from
     code_lr: float = 0.02
@@ -53,8 +54,8 @@ class CycleConfig:
             raise AvatarError(
                 f"second_steps: expected at least 0, clip: above 0; got {self.second_steps}, {self.clip}."
             )
-        if min(self.first_lr, self.second_lr, self.code_lr) <= 0:
-            raise AvatarError("first_lr, second_lr, code_lr: expected above 0.")
+        if min(self.first_lr, self.second_lr, self.code_lr) <= 0 or not 0 < self.decay <= 1:
+            raise AvatarError("first_lr, second_lr, code_lr: expected above 0, decay: in (0, 1].")
 
     @property
     def steps(self) -> int:
@@ -144,7 +145,7 @@ class CycleTrainer:
             else (self.config.first_steps, self.config.first_lr)
         )
         progress = (stage if stage >= 0 else self.step) / steps
-        self.optimiser.param_groups[0]["lr"] = rate * rate_factor(progress)
+        self.optimiser.param_groups[0]["lr"] = rate * rate_factor(progress, self.config.decay)
         batch = self.batch_at(self.step)
         codes = self.model.batch_codes(batch)
         cycle = self.model(batch, codes, together=stage >= 0)
@@ -187,9 +188,9 @@ class CycleTrainer:
             self.step, self.seconds = state["step"], state["seconds"]
 
 
-def rate_factor(progress: float) -> float:
-    """The learning rate's factor at a share of a stage: a tenth from half on, a hundredth from three quarters."""
-    return 0.1 ** ((progress >= 0.5) + (progress >= 0.75))
+def rate_factor(progress: float, decay: float) -> float:
+    """The learning rate's factor at a share of a stage: it falls at half and at three quarters."""
+    return decay ** ((progress >= 0.5) + (progress >= 0.75))
 
 
 def find_code(model: Canonicalizer, template: Template, scan: PosedScan, start: Tensor, config: CycleConfig) -> Tensor:
@@ -207,7 +208,7 @@ def find_code(model: Canonicalizer, template: Template, scan: PosedScan, start: 
     code = start.detach().clone().requires_grad_()
     optimiser = torch.optim.Adam([code], lr=config.code_lr)
     for step in range(config.code_steps):
-        optimiser.param_groups[0]["lr"] = config.code_lr * rate_factor(step / config.code_steps)
+        optimiser.param_groups[0]["lr"] = config.code_lr * rate_factor(step / config.code_steps, config.decay)
         generator = torch.Generator().manual_seed(config.seed * SEED_STRIDE + step)
         batch = draw_batch([scan], [0], template.weights.cpu(), config.draw, generator).to(code.device)
         cycle = model(batch, code[None], together=True)
