@@ -25,8 +25,8 @@ class PosedScan:
     ``points (M, 3)``; ``nearest (M,)`` the body vertex nearest to each; ``edges (E, 2, 3)`` ends of the scan's edges
     outside concave regions; ``body (V, 3)``; ``canonical_body (V, 3)`` with the pose blendshapes of this pose, where
     the body has them; ``vertices (P,)`` indices of body vertices in proportion to their areas, for faces and fingers
-    have more than their share; ``joint_transforms (J, 4, 4)`` posed_from_canonical; ``pose (3 (J - 1),)`` axis-angle without
-    the root's; ``box (2, 3)`` around the posed body.
+    have more than their share; ``joint_transforms (J, 4, 4)`` posed_from_canonical; ``pose (3 (J - 1),)`` axis-angle
+    without the root's; ``box (2, 3)`` around the posed body.
     """
 
     points: Tensor
