@@ -1,20 +1,39 @@
-"""`canonicalize`: posed raw scans to T-pose scans and a skinning field, with pictures of both."""
+"""`canonicalize`: posed raw scans to T-pose scans and a skinning field, with pictures of both and their scores."""
 
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
+from avatar.canonical.rivals import SkinningSource
+from avatar.canonical.scans import canonicalize_scan
 from avatar.data.batches import FrameDataset
+from avatar.evaluation.canonical_scores import canonical_table, score_canonicalization
+from avatar.evaluation.canonical_truth import Canonicalized
+from avatar.evaluation.scores import Scores, write_scores
+from avatar.evaluation.scoring import Label
+from avatar.evaluation.tables import to_markdown
 from avatar.export.drawing import Camera, frame_camera
 from avatar.export.pictures import contact_sheet, render_mesh, render_points, save_picture
 from avatar.io.canonical_scans import read_canonical_scan
+from avatar.io.npz import write_whole
+from avatar.pipeline.scores import current_commit
 from avatar.pipeline.surfaces import spaced_frames
-from avatar.records import Mesh, PointCloud
-from avatar.training.canonicalizing import CanonicalizeConfig, canonicalize_frames, train_canonicalizer
+from avatar.records import Frame, Mesh, PointCloud
+from avatar.training.canonicalizing import (
+    CanonicalizeConfig,
+    Skinning,
+    TrainedCanonicalizer,
+    canonicalize_frames,
+    skinning_source,
+    train_canonicalizer,
+)
 
 COLUMNS = ("scan", "weights", "canonical, front", "canonical, back", "weights, front", "weights, back")
 PICTURE = (480, 480)
@@ -26,7 +45,54 @@ def canonicalize(config: CanonicalizeConfig) -> Path:
     train_canonicalizer(config, frames)
     canonicalize_frames(config, frames)
     draw_canonical_scans(config, frames)
+    if config.scored:
+        score_canonical_scans(config, frames)
     return config.folder
+
+
+def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> Scores:
+    """Writes ``<run>/scores.csv`` and ``scores.md``: this run, both rivals and the true weights on some frames.
+
+    Variants are the splits: frames of training were learned from, those of test found their codes alone.
+
+    Raises:
+        AvatarError: for data that were not simulated: nobody knows their canonical places.
+    """
+    outfit, scores, tables = frames.outfits[0], Scores(), []
+    kinds = dict.fromkeys((config.weights, Skinning.knn, Skinning.nearest))
+    for split in dict.fromkeys(where.split for where in frames.names):
+        names = spaced_frames([where.name for where in frames.names if where.split == split], config.scored)
+        methods = {}
+        for kind in kinds:
+            source = skinning_source(replace(config, weights=kind), outfit.template)
+            learned = (source.steps, source.seconds) if isinstance(source, TrainedCanonicalizer) else (0, 0.0)
+            methods[Label(kind.value, "canonical", split, 0, *learned, current_commit())] = carrier(config, source)
+        found = score_canonicalization(outfit, split, names, methods)
+        tables.append(f"## {split}\n\n{to_markdown(canonical_table(found.rows, outfit.name))}")
+        scores = scores + found
+    write_scores(config.folder / "scores.csv", scores)
+    text = "\n".join(tables)
+    write_whole(config.folder / "scores.md", text.encode())
+    print(text)
+    return scores
+
+
+def carrier(config: CanonicalizeConfig, source: SkinningSource) -> Callable[[Frame], Canonicalized]:
+    """What a source of weights makes of a frame, with the weights that it gives to canonical points."""
+    learned = isinstance(source, TrainedCanonicalizer)
+    template = source.template
+    field = source.forward_field if learned else None
+
+    def carry(frame: Frame) -> Canonicalized:
+        weights = source.weights_of(frame.scan.points, frame)
+        scan = canonicalize_scan(frame.scan, frame.body, weights, template, config.stretch)
+        if field is not None:
+            points = torch.from_numpy(scan.points)[None].to(next(field.parameters()).device)
+            with torch.no_grad():
+                return Canonicalized(scan, field(points)[0].cpu().numpy())
+        return Canonicalized(scan, source.blend_weights(scan.points, template.vertices.numpy()))
+
+    return carry
 
 
 def draw_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> list[Path]:

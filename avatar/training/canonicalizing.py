@@ -25,6 +25,7 @@ from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
 from avatar.data.outfits import SAFE_NAME, Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
+from avatar.data.soundness import check_frame_count
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.io.canonical_scans import read_canonical_scan, read_stamp, write_canonical_scan
 from avatar.io.meshes import write_mesh
@@ -58,21 +59,22 @@ class CanonicalizeConfig:
     data_root: Path = Path("data")
     runs_root: Path = Path("runs")
     weights: Skinning = Skinning.learned
-    scan: ScanConfig = field(default_factory=lambda: replace(SCANNERS["raw"]))
+    scan: ScanConfig = field(default_factory=lambda: replace(SCANNERS["raw_mesh"]))
     split: SplitConfig = field(default_factory=lambda: SplitConfig(validation_share=0.0))
     canonicalizer: CanonicalizerConfig = field(default_factory=CanonicalizerConfig)
     train: CycleConfig = field(default_factory=CycleConfig)
     stretch: float = STRETCH  # longest that an edge of a scan may become, as a multiple
     pictures: int = 4  # frames of each split in pictures
+    scored: int = 0  # frames of each split compared with their truth, beside both rivals; simulated outfits only
     device: str = "auto"  # auto takes CUDA where there is one
 
     def __post_init__(self):
         if not SAFE_NAME.fullmatch(self.name):
             raise AvatarError(f"name: expected a plain name (letters, digits, '_', '.', '-'), got {self.name!r}.")
-        if self.stretch <= 1 or self.pictures < 0:
-            raise AvatarError(
-                f"stretch: expected above 1, pictures: at least 0; got {self.stretch} and {self.pictures}."
-            )
+        if self.stretch <= 1:
+            raise AvatarError(f"stretch: expected above 1, got {self.stretch}.")
+        if min(self.pictures, self.scored) < 0:
+            raise AvatarError(f"pictures, scored: expected at least 0, got {self.pictures} and {self.scored}.")
 
     @property
     def folder(self) -> Path:
@@ -150,12 +152,13 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     if config.weights is not Skinning.learned or is_trained(config):
         return config.folder
     learned = [index for index, where in enumerate(frames.names) if where.split == "train"]
+    names = [frames.names[index].name for index in learned]
+    check_frame_count(names, frames.outfits[0].path / "train", "the canonicalizer")
     pool = config.train.draw.pool
     scans = [
         prepare_scan(frames.frame(index), template, pool, config.train.seed)
         for index in tqdm(learned, desc="prepare scans", disable=None)
     ]
-    names = [frames.names[index].name for index in learned]
     torch.manual_seed(config.train.seed)
     model = Canonicalizer(template, len(scans), config.canonicalizer).to(choose_device(config.device))
     trainer = CycleTrainer(model, template, scans, names, config.train, config.folder)

@@ -184,6 +184,7 @@ def save_settings(config: RunConfig) -> None:
         before = flatten(yaml.safe_load(path.read_text()))
         now = flatten(plain)
         free = {"train.steps", "train.minutes", "train.save_every", "train.log_every", "device", "data_root"}
+        free |= {"pictures", "scored"}  # of canonicalizers' runs
         changed = [key for key in sorted(before.keys() | now.keys()) if before.get(key) != now.get(key)]
         changed = [key for key in changed if key not in free]
         if changed:

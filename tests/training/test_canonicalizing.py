@@ -9,23 +9,27 @@ import torch
 from limbs import arm_frame, arm_template, legs_template, skirt_frame
 
 import avatar.training.cycles as cycles
+from avatar.body.packed import read_template
 from avatar.body.skinning import skin_transforms
 from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
 from avatar.canonical.fields import SkinningFieldConfig
 from avatar.canonical.losses import TERMS
 from avatar.canonical.posed import DrawConfig, prepare_scan, to_root_frame
 from avatar.checks import AvatarError, DataError
+from avatar.data.batches import FrameDataset
 from avatar.data.scanner import ScanConfig
+from avatar.evaluation.scores import read_scores
 from avatar.geometry.transforms import transform_points
 from avatar.io.canonical_scans import read_canonical_scan, read_stamp
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
-from avatar.pipeline.canonicalization import canonicalize, weight_colors
+from avatar.pipeline.canonicalization import canonicalize, carrier, weight_colors
 from avatar.training.canonicalizing import (
     CanonicalizeConfig,
     Skinning,
     canonicalize_frames,
     load_canonicalizer,
+    skinning_source,
     train_canonicalizer,
 )
 from avatar.training.cycles import CycleConfig, CycleTrainer, find_code, rate_factor
@@ -253,8 +257,30 @@ def test_rivals_have_nothing_to_learn_and_no_field(settings, kind):
         load_canonicalizer(run)
 
 
+def test_one_frame_is_refused_with_the_reason(settings):
+    frames = settings.frames()
+    lone = FrameDataset(frames.outfits, frames.names[:1], points=1)
+    with pytest.raises(DataError, match=r"canonicalizer needs at least 2 frames.*add scans"):
+        train_canonicalizer(replace(settings, name="lone"), lone)
+
+
+def test_a_run_is_scored_against_the_truth_beside_its_rivals(settings, folder):
+    canonicalize(replace(settings, scored=2, pictures=0))
+    scores = read_scores(folder / "scores.csv")
+    values = {(row.method, row.variant, row.metric): row.value for row in scores.rows}
+    assert {(method, split) for method, split, _ in values} >= {
+        (kind.value, split) for kind in Skinning for split in ("train", "test")
+    }
+    assert all(len({f.frame for f in scores.frames if f.variant == split}) == 2 for split in ("train", "test"))
+    assert values["nearest", "train", "cycle_cm"] != values["learned", "train", "cycle_cm"]
+    frame = settings.frames().frame(0)
+    back = carrier(settings, skinning_source(settings, read_template(folder / "template.npz")))(frame)
+    assert np.allclose(back.forward_weights.sum(axis=1), 1, atol=1e-5)
+    assert "| truth_cm (cm) |" in (folder / "scores.md").read_text()
+
+
 def test_bad_settings_are_refused_by_name(settings):
-    for option in ({"name": "../x"}, {"stretch": 1.0}, {"pictures": -1}):
+    for option in ({"name": "../x"}, {"stretch": 1.0}, {"pictures": -1}, {"scored": -1}):
         with pytest.raises(AvatarError, match=next(iter(option))):
             replace(settings, **option)
     for option in ({"first_steps": 0}, {"second_steps": -1}, {"clip": 0.0}, {"code_lr": 0.0}, {"batch": 0}):
