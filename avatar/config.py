@@ -25,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from avatar.checks import AvatarError
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.demo import DemoConfig
+from avatar.pipeline.experiments import ExperimentConfig
 from avatar.pipeline.methods import SETTINGS
 from avatar.pipeline.outcomes import State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
 from avatar.pipeline.reporting import ReportConfig
@@ -46,6 +47,7 @@ VERBS = {
     "predict": PredictConfig,
     "evaluate": EvaluateConfig,
     "compare": CompareConfig,
+    "experiment": ExperimentConfig,
     "mesh": MeshConfig,
     "export": ExportConfig,
     "report": ReportConfig,
@@ -70,12 +72,13 @@ def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
     return settings_from_dict(kind, plain)
 
 
-def command(verb: str, run: Callable[[Any], Any]) -> None:
+def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], Any] | None = None) -> None:
     """Runs a verb from the command line: composes its config, converts it, calls ``run`` with the settings.
 
     Bad input ends in one line on standard error and exit code 2, not in a traceback; a signal that asks to stop in
     exit code 75 once all is saved. In a multirun, by whatever launcher, the other jobs go on after a failure; those
-    that did not finish are named with the reason at the end, and the exit code is 2.
+    that did not finish are named with the reason at the end, and the exit code is 2. After that ``then`` is called
+    with the settings of the jobs that did finish, if any.
     """
     register()
     journal = Path("runs/multirun").absolute() / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{os.getpid()}"
@@ -96,6 +99,13 @@ def command(verb: str, run: Callable[[Any], Any]) -> None:
     outcomes = read_outcomes(journal)
     if outcomes:
         print(summarise(outcomes), file=sys.stderr)
+    done = [settings_from_dict(VERBS[verb], o.settings) for o in outcomes if o.state == State.finished.value]
+    if then is not None and done:
+        try:
+            then(done)
+        except AvatarError as error:
+            print(f"{verb}: {error}", file=sys.stderr)
+            code = code or 2
     states = {State(outcome.state) for outcome in outcomes} - {State.finished}
     sys.exit(STOPPED if State.stopped in states else code or (2 if states else 0))
 
@@ -124,8 +134,9 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
     if several:
         note_outcome(journal, job.job.num, name, State.running)
     try:
+        settings = to_settings(VERBS[verb], config)
         with leave_when_asked():
-            run(to_settings(VERBS[verb], config))
+            run(settings)
     except Stopped as stopped:
         return end(State.stopped, str(stopped), STOPPED)
     except SystemExit as leaving:
@@ -140,5 +151,5 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
         traceback.print_exc()
         return end(State.failed, f"{type(error).__name__}: {error}", 1)
     if several:
-        note_outcome(journal, job.job.num, name, State.finished)
+        note_outcome(journal, job.job.num, name, State.finished, settings=settings_to_dict(settings))
     return None

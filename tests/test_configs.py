@@ -2,9 +2,11 @@
 
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
@@ -47,9 +49,30 @@ def test_every_method_and_size_gives_its_settings(method, size):
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes_and_says_how_to_run_it(experiment):
-    load("train", f"experiment={experiment}")
-    first = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()[0]
-    assert first.startswith("# python tools/train.py") and f"experiment={experiment}" in first
+    config = load("experiment", f"experiment={experiment}")
+    assert config.compare.table == experiment and config.run.name.startswith(experiment)
+    assert set(config.score.metrics) == set(config.compare.metrics)
+    lines = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()
+    assert lines[:2] == ["# @package _global_", f"# python tools/experiment.py experiment={experiment}"]
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_no_two_jobs_of_an_experiment_share_a_folder(experiment):
+    """Two values of each option that its file sweeps, in all combinations."""
+    plain = yaml.safe_load((CONF / "experiment" / f"{experiment}.yaml").read_text())
+    swept = {key: str(values).split(",")[:2] for key, values in plain["hydra"]["sweeper"]["params"].items()}
+    folders = []
+    for values in product(*swept.values()):
+        choices = [f"{key}={value}" for key, value in zip(swept, values)]
+        folders.append(load("experiment", f"experiment={experiment}", *choices).run.folder)
+    assert len(set(folders)) == len(folders) > 1
+
+
+def test_equal_time_instead_of_equal_steps_is_one_switch():
+    steps = load("experiment", "experiment=closet5", "train.steps=70").run
+    assert (steps.train.steps, steps.train.minutes, steps.name) == (70, None, "closet5_70steps_1_seed0")
+    clock = load("experiment", "experiment=closet5", "budget=minutes", "train.minutes=0.5").run
+    assert (clock.train.steps, clock.train.minutes, clock.name) == (1_000_000, 0.5, "closet5_0.5min_1_seed0")
 
 
 def test_several_outfits_and_nested_options():

@@ -37,16 +37,22 @@ BASES = {View.OF_BODY: "body", View.OF_STATIC: "static"}
 
 @dataclass(frozen=True)
 class TableRow:
-    """A labelled row; None stands where there is no number. ``summary`` rows are set off from the others."""
+    """A labelled row; None stands where there is no number. ``summary`` rows are set off from the others.
+
+    ``texts`` are printed in the numbers' place where there is more to say.
+    """
 
     label: str
     values: tuple[float | None, ...]
     decimals: int = 3
     summary: bool = False
+    texts: tuple[str, ...] | None = None
 
     @property
     def cells(self) -> tuple[str, ...]:
         """The numbers as printed."""
+        if self.texts is not None:
+            return self.texts
         return tuple("–" if value is None else f"{value:.{self.decimals}f}" for value in self.values)
 
 
