@@ -1,14 +1,17 @@
-"""Plots across runs: error by the share of training frames, and error against the time training took."""
+"""Plots across runs: error by the share of training frames, by the time training took, and as training went on."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from avatar.checks import AvatarError
 from avatar.evaluation.aggregate import FLOORS, Cell, base_method, frame_weighted_mean, method_key, order_methods
 from avatar.evaluation.metrics import find_metrics
-from avatar.evaluation.plots import COLOURS, INK, add_legend, make_panels
+from avatar.evaluation.plots import COLOURS, INK, add_legend, make_panels, read_curves
 from avatar.evaluation.scores import Score
 
 if TYPE_CHECKING:
@@ -68,6 +71,27 @@ def plot_times(rows: Sequence[Score], metric: str) -> Figure:
     panel.set_xlabel("minutes of training a run", fontsize=8, color=INK)
     panel.set_ylabel(f"{known.name} ({known.shown_in})", fontsize=8, color=INK)
     add_legend(figure, panel)
+    return figure
+
+
+def plot_progress(logs: Mapping[str, Mapping[str, Path]]) -> Figure:
+    """Chamfer distance on held-back training frames against the minutes trained: a panel an outfit, a line a method.
+
+    Args:
+        logs: training logs by outfit and method; those that never validated a Chamfer distance draw no line.
+    """
+    figure, panels = make_panels(len(logs))
+    methods = order_methods({method for mine in logs.values() for method in mine})
+    for panel, (outfit, mine) in zip(panels, logs.items()):
+        for place, method in enumerate(methods):
+            points = read_curves(mine[method], "seconds").get("chamfer", {}) if method in mine else {}
+            curve = [(seconds / 60, value * 1e4) for seconds, value in points.get("validation", [])]
+            colour = COLOURS[place % len(COLOURS)]
+            panel.plot(*zip(*curve or [(np.nan, np.nan)]), ".-", color=colour, linewidth=1.4, label=method)
+        panel.set_title(outfit, fontsize=9, color=INK)
+        panel.set_xlabel("minutes of training", fontsize=8, color=INK)
+        panel.set_ylabel("Chamfer, held back (1e-4 m²)", fontsize=8, color=INK)
+    add_legend(figure, panels[0])
     return figure
 
 

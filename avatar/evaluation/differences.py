@@ -60,13 +60,13 @@ def compare_methods(
 
 
 def find_baseline(method: str, methods: Sequence[str], baseline: str) -> str | None:
-    """What a method is set against: the baseline of its own variant, else the only one there is, else nothing."""
+    """What a method is set against: the baseline of its own variant, else the plain or the only one, else nothing."""
+    candidates = [other for other in methods if base_method(other) == baseline]
+    own = baseline + method.removeprefix(base_method(method))
+    if own in candidates:
+        return own
     if baseline in methods:
         return baseline
-    candidates = [other for other in methods if base_method(other) == baseline]
-    variant = method.removeprefix(base_method(method))
-    if baseline + variant in candidates:
-        return baseline + variant
     return candidates[0] if len(candidates) == 1 else None
 
 
@@ -95,7 +95,6 @@ def difference_table(found: Sequence[Difference], metric: str) -> Table:
         f"Difference to the baseline ({', '.join(dict.fromkeys(d.baseline for d in mine))}) with its {confidence:g}% "
         "interval: percentile bootstrap over frames, paired by frame, redrawn within each outfit. An interval speaks "
         "of other frames, not of another training.",
-        f"{known.name}: {known.definition}",
     )
     return Table(f"{known.name}, difference ({known.shown_in})", "outfit", methods, tuple(rows), notes)
 
@@ -129,7 +128,7 @@ def budget_table(rows: Sequence[Score]) -> Table:
         steps |= {count for count, _ in runs}
         minutes += [seconds / 60 for _, seconds in runs]
         mean = (float(np.mean([count for count, _ in runs])), float(np.mean([seconds for _, seconds in runs])) / 60)
-        body.append(TableRow(method, mean, decimals=1))
+        body.append(TableRow(method, mean, texts=(f"{mean[0]:,.0f}", f"{mean[1]:.1f}")))
     if not body:
         note = "Nothing here was trained."
     elif len(steps) == 1:

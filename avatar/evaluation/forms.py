@@ -8,10 +8,10 @@ from enum import Enum
 from itertools import product
 
 from avatar.checks import AvatarError
-from avatar.evaluation.aggregate import FLOORS, Cell, frame_weighted_mean, worst_outfit
+from avatar.evaluation.aggregate import FLOORS, Cell, base_method, frame_weighted_mean, worst_outfit
 from avatar.evaluation.metrics import METRICS, find_metrics
 from avatar.evaluation.scores import Score
-from avatar.evaluation.tables import Table, TableRow
+from avatar.evaluation.tables import Table, TableRow, seed_notes
 
 MEAN, WORST = "mean", "max"  # over frames of all outfits; over outfits
 
@@ -71,10 +71,13 @@ class _Place:
     fraction: str
 
 
-def form_table(rows: Sequence[Score], metrics: Sequence[str], form: FormConfig, title: str = "") -> Table:
+def form_table(
+    rows: Sequence[Score], metrics: Sequence[str], form: FormConfig, title: str = "", excess: bool = False
+) -> Table:
     """Scores in a paper's form; methods and outfits in their order of appearance, floors first.
 
-    Several seeds of a method are averaged, and named in the notes.
+    Several seeds of a method are averaged, and named in the notes. With ``excess`` every value is less the sampling
+    floor's on the same outfit.
 
     Raises:
         AvatarError: for unknown metrics, metrics that nobody scored, or two scores of one seed for one cell.
@@ -83,6 +86,10 @@ def form_table(rows: Sequence[Score], metrics: Sequence[str], form: FormConfig, 
     cells = _cells([row for row in rows if row.metric in known], Axis.fraction in (*form.rows, *form.columns))
     if not cells:
         raise AvatarError(f"rows: no score of {', '.join(known)} among them.")
+    notes = [f"{name}: {metric.definition}" for name, metric in known.items()] + seed_notes(rows)
+    if excess:
+        cells = _above_sampling(cells)
+        notes.append("Excess: the value less the sampling floor's on the same outfit.")
     _summarise(cells)
     shown = _labels(cells, form)
     down, across = (list(product(*(shown[axis] for axis in axes))) for axes in (form.rows, form.columns))
@@ -96,7 +103,6 @@ def form_table(rows: Sequence[Score], metrics: Sequence[str], form: FormConfig, 
                 TableRow(", ".join(_name(axis, label) for axis, label in line.items()), tuple(values), 3, summary)
             )
     heads = tuple(", ".join(_name(axis, label) for axis, label in zip(form.columns, column)) for column in across)
-    notes = [f"{name}: {metric.definition}" for name, metric in known.items()] + _seed_notes(rows)
     return _without_empty_columns(Table(title, ", ".join(a.value for a in form.rows), heads, tuple(body), tuple(notes)))
 
 
@@ -128,6 +134,16 @@ def _cells(rows: Iterable[Score], by_fraction: bool) -> dict[_Place, Cell]:
     return cells
 
 
+def _above_sampling(cells: dict[_Place, Cell]) -> dict[_Place, Cell]:
+    """Every cell less the sampling floor of its outfit and metric; those without one are left out."""
+    floors = {(p.outfit, p.metric): c.value for p, c in cells.items() if base_method(p.method) == "sampling"}
+    return {
+        place: Cell(cell.value - floors[place.outfit, place.metric], cell.frames, cell.points)
+        for place, cell in cells.items()
+        if (place.outfit, place.metric) in floors and base_method(place.method) != "sampling"
+    }
+
+
 def _summarise(cells: dict[_Place, Cell]) -> None:
     """Adds the mean over frames and the worst outfit of every method that has all the outfits."""
     outfits = {place.outfit for place in cells}
@@ -146,7 +162,7 @@ def _labels(cells: dict[_Place, Cell], form: FormConfig) -> dict[Axis, list[str]
     """The labels on each axis, in order."""
     methods = list(dict.fromkeys(place.method for place in cells))
     rank = {floor: place for place, floor in enumerate(FLOORS)}
-    methods.sort(key=lambda method: rank.get(method.split(" (")[0], len(rank)))
+    methods.sort(key=lambda method: rank.get(base_method(method), len(rank)))
     outfits = [name for name in dict.fromkeys(place.outfit for place in cells) if name not in (MEAN, WORST)]
     several = len(outfits) > 1
     outfits = (outfits if form.outfits or not several else []) + ([MEAN, WORST] if form.summary and several else [])
@@ -171,15 +187,6 @@ def _name(axis: Axis, label: str) -> str:
     if axis is Axis.metric and METRICS[label].shown_in != "1":
         return f"{label} ({METRICS[label].shown_in})"
     return label
-
-
-def _seed_notes(rows: Sequence[Score]) -> list[str]:
-    """Which methods are means over several seeds."""
-    seeds: dict[str, set[int]] = {}
-    for row in rows:
-        seeds.setdefault(row.method, set()).add(row.seed)
-    several = {method: sorted(found) for method, found in seeds.items() if len(found) > 1}
-    return [f"Mean over seeds: {m} {', '.join(map(str, found))}." for m, found in several.items()]
 
 
 def _without_empty_columns(table: Table) -> Table:

@@ -33,7 +33,7 @@ def plot_losses(metrics_csv: str | Path) -> Figure:
     Raises:
         DataError: when the log is missing, lacks ``split`` and ``step``, or holds no number.
     """
-    curves = _read_curves(Path(metrics_csv))
+    curves = read_curves(Path(metrics_csv))
     figure, panels = make_panels(len(curves))
     for panel, (term, splits) in zip(panels, curves.items()):
         for colour, (split, points) in zip(COLOURS, splits.items()):
@@ -116,20 +116,24 @@ def inline_svg(figure: Figure, prefix: str, title: str) -> str:
     return (root + svg[svg.index(">") + 1 :]).replace("xlink:href", "href")
 
 
-def _read_curves(path: Path) -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """Term to split to (step, value) points."""
+def read_curves(path: Path, against: str = "step") -> dict[str, dict[str, list[tuple[float, float]]]]:
+    """A training log as term to split to (step or seconds, value) points.
+
+    Raises:
+        DataError: when the log is missing, lacks a column, or holds no number.
+    """
     if not path.is_file():
         raise DataError(path, "there is no training log here.", "Train first.")
     curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         names = reader.fieldnames or []
-        if not {"split", "step"} <= set(names):
-            raise DataError(path, f"expected the columns split and step, got {', '.join(names) or 'none'}.")
+        if not {"split", against} <= set(names):
+            raise DataError(path, f"expected the columns split and {against}, got {', '.join(names) or 'none'}.")
         for row in reader:
             for term in (name for name in names if name not in LOG_COLUMNS and row[name]):
                 try:
-                    point = (float(row["step"]), float(row[term]))
+                    point = (float(row[against]), float(row[term]))
                 except ValueError as error:
                     raise DataError(path, f"line {reader.line_num}, {term}: {error}.") from error
                 curves.setdefault(term, {}).setdefault(row["split"], []).append(point)

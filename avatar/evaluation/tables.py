@@ -15,6 +15,7 @@ from avatar.evaluation.aggregate import (
     Cell,
     base_method,
     frame_weighted_mean,
+    method_key,
     order_methods,
     tabulate,
     worst_outfit,
@@ -91,7 +92,8 @@ def outfit_table(rows: Sequence[Score], metric: str, view: View = View.VALUE) ->
     body.append(TableRow("min over outfits" if falls else "max over outfits", worst, summary=True))
     unit = "ratio" if view in BASES else known.shown_in
     title = f"{known.name}, {view.value} ({unit})"
-    return Table(title, "outfit", tuple(methods), tuple(body), (*_notes(known, view), *_point_notes(grid)))
+    notes = (*_notes(known, view), *_point_notes(grid), *seed_notes(rows))
+    return Table(title, "outfit", tuple(methods), tuple(body), notes)
 
 
 def metric_table(rows: Sequence[Score], outfit: str, metrics: Sequence[str] = tuple(METRICS)) -> Table:
@@ -131,10 +133,12 @@ def _viewed(cells: dict[str, Cell], metric: Metric, view: View) -> dict[str, Cel
     excess = {method: Cell(c.value - floor.value, c.frames, c.points) for method, c in cells.items()}
     if view is View.EXCESS:
         return {method: Cell(c.value * metric.scale, c.frames, c.points) for method, c in excess.items()}
-    base = _find_floor(excess, BASES[view])
-    if base is None or base.value == 0:
-        return {}
-    return {method: Cell(c.value / base.value, c.frames, c.points) for method, c in excess.items()}
+    bases = {method: _find_base(excess, method, BASES[view]) for method in excess}
+    return {
+        method: Cell(c.value / base.value, c.frames, c.points)
+        for method, c in excess.items()
+        if (base := bases[method]) is not None and base.value != 0
+    }
 
 
 def _value(cells: dict[str, Cell], method: str) -> float | None:
@@ -148,6 +152,15 @@ def _plain_mean(cells: Sequence[Cell]) -> float:
 def _find_floor(cells: dict[str, Cell], floor: str) -> Cell | None:
     """A floor's cell, whatever its variant."""
     return next((cell for method, cell in cells.items() if base_method(method) == floor), None)
+
+
+def _find_base(cells: dict[str, Cell], method: str, floor: str) -> Cell | None:
+    """The floor a method is measured by: that of its own variant, or the only one there is."""
+    variant = method.removeprefix(base_method(method))
+    floors = [key for key in cells if base_method(key) == floor]
+    if len(floors) > 1:
+        floors = [key for key in floors if key == floor + variant]
+    return cells[floors[0]] if floors else None
 
 
 def _check_floor(methods: list[str], floor: str, view: View) -> None:
@@ -172,6 +185,15 @@ def _point_notes(grid: dict[str, dict[str, Cell]]) -> list[str]:
         return []
     listed = "; ".join(f"{m} {', '.join(f'{c:,}' for c in sorted(counts[m]))}" for m in order_methods(set(counts)))
     return [f"Point counts differ, and with them the sampling floor: {listed}."]
+
+
+def seed_notes(rows: Sequence[Score]) -> list[str]:
+    """Which methods' numbers are means over several trainings."""
+    seeds: dict[str, set[int]] = {}
+    for row in rows:
+        seeds.setdefault(method_key(row), set()).add(row.seed)
+    several = {method: sorted(found) for method, found in seeds.items() if len(found) > 1}
+    return [f"Mean over seeds: {m} {', '.join(map(str, found))}." for m, found in several.items()]
 
 
 def to_markdown(table: Table) -> str:

@@ -10,9 +10,9 @@ import yaml
 
 from avatar.checks import AvatarError, DataError
 from avatar.data.outfits import SAFE_NAME
-from avatar.evaluation.aggregate import FLOORS
+from avatar.evaluation.aggregate import FLOORS, method_key
 from avatar.evaluation.canonical_scores import canonical_table
-from avatar.evaluation.curves import plot_fractions, plot_times
+from avatar.evaluation.curves import plot_fractions, plot_progress, plot_times
 from avatar.evaluation.differences import budget_table, compare_methods, difference_table, differences_csv
 from avatar.evaluation.forms import FormConfig, ReportedTable, form_table, reported_table
 from avatar.evaluation.metrics import find_metrics
@@ -68,13 +68,14 @@ def compare(config: CompareConfig) -> Path:
     """
     runs = config.runs or tuple(named_runs(config))
     scores = gather_scores(config, runs)
-    rows = [replace(row, table=config.table) for row in scores.rows]
-    write_scores(file_of(config, "csv"), Scores(rows, scores.frames))
-    tables = [*main_tables(config, rows), *side_tables(config, Scores(rows, scores.frames))]
+    write_scores(file_of(config, "csv"), scores)
+    scores, shared = without_shared_variant(scores)
+    tables = [*main_tables(config, scores.rows), *side_tables(config, scores)]
+    tables[0] = replace(tables[0], notes=(*tables[0].notes, *([f"All methods: {shared}."] if shared else [])))
     if config.reported is not None:
         tables.append(reported_table(config.reported))
     tables += canonical_tables(config)
-    pictures = [*save_plots(config, rows)]
+    pictures = [*save_plots(config, scores.rows, runs)]
     if config.pictures:
         grid = file_of(config, "poses.png")
         pictures += [grid] if draw_pose_grid(grid, runs, config.pictures, config.split, config.data_root) else []
@@ -122,7 +123,17 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
     for outfit, (dataset,) in sorted(homes.items()):
         path = config.runs_root / "floors" / dataset / outfit / "scores.csv"
         floors = floors + (read_scores(path) if path.is_file() else Scores())
-    return floors + scores
+    whole = floors + scores
+    return Scores([replace(row, table=config.table) for row in whole.rows], whole.frames)
+
+
+def without_shared_variant(scores: Scores) -> tuple[Scores, str]:
+    """The scores without a variant that all trained methods share, and that variant: it tells nothing apart."""
+    variants = {row.variant for row in scores.rows if row.method not in FLOORS[:2]}
+    shared = variants.pop() if len(variants) == 1 else ""
+    rows = [replace(row, variant="") if row.variant == shared else row for row in scores.rows]
+    frames = [replace(row, variant="") if row.variant == shared else row for row in scores.frames]
+    return Scores(rows, frames), shared
 
 
 def dataset_of(run: Path) -> str:
@@ -137,7 +148,12 @@ def main_tables(config: CompareConfig, rows: list[Score]) -> list[Table]:
     """The table in the form asked for, or outfits by methods for each metric with the excess over the floors."""
     metrics = [name for name in config.metrics if name in {row.metric for row in rows}]
     if config.form is not None:
-        return [form_table(rows, metrics, config.form, config.table)]
+        tables = [form_table(rows, metrics, config.form, config.table)]
+        distances = [name for name in metrics if name.startswith("cd_")]
+        if distances and any(row.method == "sampling" for row in rows):
+            title = f"{config.table}, excess over the sampling floor"
+            tables.append(form_table(rows, distances, config.form, title, excess=True))
+        return tables
     tables = [outfit_table(rows, metric) for metric in metrics]
     methods = {row.method for row in rows}
     if {"sampling", "body"} <= methods and "cd_point" in metrics:
@@ -174,14 +190,21 @@ def canonical_tables(config: CompareConfig) -> list[Table]:
     return tables
 
 
-def save_plots(config: CompareConfig, rows: list[Score]) -> Iterator[Path]:
-    """Error by outfit, by share of the training frames where several were trained on, and against training time."""
+def save_plots(config: CompareConfig, rows: list[Score], runs: tuple[Path, ...]) -> Iterator[Path]:
+    """Error by outfit, by share of the training frames where there are several, and against training time."""
     metric = next((name for name in config.metrics if name in {row.metric for row in rows}), None)
     if not config.plots or metric is None:
         return
     figures = {"outfits": plot_outfits(rows, metric), "times": plot_times(rows, metric)}
     if len({row.fraction for row in rows if row.method not in FLOORS}) > 1:
         figures["fractions"] = plot_fractions(rows, metric)
+    logs: dict[str, dict[str, Path]] = {}
+    for run in runs:
+        if (run / "metrics.csv").is_file():
+            first = read_scores(run / "scores.csv").rows[0]
+            logs.setdefault(run.parent.name, {})[method_key(first)] = run / "metrics.csv"
+    if logs:
+        figures["progress"] = plot_progress(logs)
     for name, figure in figures.items():
         save_figure(figure, file_of(config, f"{name}.png"))
         yield file_of(config, f"{name}.png")
