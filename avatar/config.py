@@ -30,6 +30,7 @@ from avatar.pipeline.methods import SETTINGS
 from avatar.pipeline.outcomes import State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
 from avatar.pipeline.reporting import ReportConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig
+from avatar.pipeline.seams import SeamsConfig
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.simulate.recording import SimulateConfig
@@ -51,6 +52,7 @@ VERBS = {
     "mesh": MeshConfig,
     "export": ExportConfig,
     "report": ReportConfig,
+    "seams": SeamsConfig,
     "demo": DemoConfig,
     "simulate": SimulateConfig,
 }

@@ -88,7 +88,7 @@ def difference_table(found: Sequence[Difference], metric: str) -> Table:
     for outfit in outfits:
         intervals = [cells.get((outfit, method)) for method in methods]
         values = tuple(None if i is None else i.difference * known.scale for i in intervals)
-        texts = tuple("–" if i is None else _written(i, known.scale) for i in intervals)
+        texts = tuple("–" if i is None else i.written(known.scale) for i in intervals)
         rows.append(TableRow(outfit, values, summary=outfit == ALL, texts=texts))
     confidence = 100 * mine[0].interval.confidence if mine else 95
     notes = (
@@ -97,11 +97,6 @@ def difference_table(found: Sequence[Difference], metric: str) -> Table:
         "of other frames, not of another training.",
     )
     return Table(f"{known.name}, difference ({known.shown_in})", "outfit", methods, tuple(rows), notes)
-
-
-def _written(interval: Interval, scale: float) -> str:
-    values = (interval.difference * scale, interval.low * scale, interval.high * scale)
-    return "{:+.3f} [{:+.3f}, {:+.3f}]".format(*values)
 
 
 def differences_csv(found: Sequence[Difference]) -> str:
