@@ -428,8 +428,8 @@ def test_atlases_that_do_not_fit_their_model_are_refused(change, message, places
 def test_an_obj_that_is_not_the_models_is_refused_with_the_mend(places, tmp_path):
     model = distinct(vars(random_model("smpl")))
     np.savez(tmp_path / "model.npz", **model)
-    obj = write_unwrapped(tmp_path / "uv.obj", model | {"v_template": np.zeros((39, 3))}, places)
-    with pytest.raises(DataError, match=r"uv\.obj.*40 vertices, got 39.*UV template of this body model"):
+    obj = write_unwrapped(tmp_path / "uv.obj", model | {"v_template": np.zeros((41, 3))}, places)
+    with pytest.raises(DataError, match=r"uv\.obj.*40 vertices, got 41.*UV template of this body model"):
         convert_body_model(tmp_path / "model.npz", tmp_path / "plain.npz", obj)
     (tmp_path / "bare.obj").write_text("v 0 0 0\n" * 40 + "f 1 2 3\n")
     with pytest.raises(DataError, match=r"bare\.obj.*no texture coordinates.*vt"):
