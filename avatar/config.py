@@ -74,6 +74,13 @@ def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
     return settings_from_dict(kind, plain)
 
 
+def compose_settings(verb: str, *overrides: str) -> Any:
+    """A verb's settings as the command line would give them with these overrides."""
+    register()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return to_settings(VERBS[verb], hydra.compose(verb, list(overrides)))
+
+
 def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], Any] | None = None) -> None:
     """Runs a verb from the command line: composes its config, converts it, calls ``run`` with the settings.
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 
 from avatar.checks import AvatarError
-from avatar.config import CONF, VERBS, register, to_settings
+from avatar.config import CONF, VERBS
+from avatar.config import compose_settings as load
 from avatar.pipeline.methods import find_settings
 from avatar.settings import settings_from_dict
 
@@ -19,12 +19,6 @@ ROOT = Path(__file__).parents[1]
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SIZES = sorted(path.stem for path in (CONF / "size").glob("*.yaml"))
-
-
-def load(verb: str, *overrides: str):
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return to_settings(VERBS[verb], compose(verb, list(overrides)))
 
 
 @pytest.mark.parametrize("verb", VERBS)
