@@ -87,7 +87,7 @@ def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], An
     Bad input ends in one line on standard error and exit code 2, not in a traceback; a signal that asks to stop in
     exit code 75 once all is saved. In a multirun, by whatever launcher, the other jobs go on after a failure; those
     that did not finish are named with the reason at the end, and the exit code is 2. After that ``then`` is called
-    with the settings of the jobs that did finish, if any.
+    with the settings of the jobs that did finish, if any, unless the multirun was asked to stop.
     """
     register()
     journal = Path("runs/multirun").absolute() / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{os.getpid()}"
@@ -96,7 +96,7 @@ def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], An
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=verb)
     def main(config: DictConfig) -> None:
-        run_job(verb, run, config, journal, parent)
+        run_job(verb, run, config, journal, parent, then)
 
     with torchrun_team() as team, leave_when_asked(lambda number: ask_to_stop(journal, number)):
         logging.basicConfig(level=logging.INFO if team.leads else logging.WARNING, format="%(message)s")
@@ -108,21 +108,29 @@ def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], An
     outcomes = read_outcomes(journal)
     if outcomes:
         print(summarise(outcomes), file=sys.stderr)
-    done = [settings_from_dict(VERBS[verb], o.settings) for o in outcomes if o.state == State.finished.value]
-    if then is not None and done:
+    states = {State(outcome.state) for outcome in outcomes} - {State.finished}
+    finished = [outcome.settings for outcome in outcomes if outcome.state == State.finished.value]
+    if then is not None and finished and State.stopped not in states:
         try:
-            then(done)
+            then([settings_from_dict(VERBS[verb], settings) for settings in finished])
         except AvatarError as error:
             print(f"{verb}: {error}", file=sys.stderr)
             code = code or 2
-    states = {State(outcome.state) for outcome in outcomes} - {State.finished}
     sys.exit(STOPPED if State.stopped in states else code or (2 if states else 0))
 
 
-def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: Path, parent: int) -> None:
+def run_job(
+    verb: str,
+    run: Callable[[Any], Any],
+    config: DictConfig,
+    journal: Path,
+    parent: int,
+    then: Callable[[list[Any]], Any] | None = None,
+) -> None:
     """One job of a verb, in the ``parent`` process or in one that a launcher started.
 
-    In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave.
+    In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. ``then`` follows a job
+    that is the only one.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")  # what verbs report; conf/hydra keeps Hydra quiet
     job = HydraConfig.get()
@@ -146,6 +154,8 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
         settings = to_settings(VERBS[verb], config)
         with leave_when_asked():
             run(settings)
+            if then is not None and not several and current_team().leads:
+                then([settings])
     except Stopped as stopped:
         return end(State.stopped, str(stopped), STOPPED)
     except SystemExit as leaving:
