@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import product
 
@@ -102,8 +102,10 @@ def form_table(
             body.append(
                 TableRow(", ".join(_name(axis, label) for axis, label in line.items()), tuple(values), 3, summary)
             )
-    heads = tuple(", ".join(_name(axis, label) for axis, label in zip(form.columns, column)) for column in across)
-    return _without_empty_columns(Table(title, ", ".join(a.value for a in form.rows), heads, tuple(body), tuple(notes)))
+    named = [[_name(axis, label) for axis, label in zip(form.columns, column)] for column in across]
+    groups = tuple(", ".join(names[:-1]) for names in named) if len(form.columns) > 1 else ()
+    corner, heads = ", ".join(axis.value for axis in form.rows), tuple(names[-1] for names in named)
+    return _without_empty_columns(Table(title, corner, heads, tuple(body), tuple(notes), groups))
 
 
 def reported_table(reported: ReportedTable) -> Table:
@@ -191,7 +193,6 @@ def _name(axis: Axis, label: str) -> str:
 
 def _without_empty_columns(table: Table) -> Table:
     kept = [i for i in range(len(table.columns)) if any(row.values[i] is not None for row in table.rows)]
-    rows = tuple(
-        TableRow(row.label, tuple(row.values[i] for i in kept), row.decimals, row.summary) for row in table.rows
-    )
-    return Table(table.title, table.corner, tuple(table.columns[i] for i in kept), rows, table.notes)
+    rows = tuple(replace(row, values=tuple(row.values[i] for i in kept)) for row in table.rows)
+    columns, groups = (tuple(heads[i] for i in kept if heads) for heads in (table.columns, table.groups))
+    return replace(table, columns=columns, rows=rows, groups=groups)

@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import groupby
 
 import numpy as np
 
@@ -59,13 +60,22 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Table:
-    """A table ready to print: ``corner`` heads the labels, ``notes`` hold the definitions printed below."""
+    """A table ready to print: ``corner`` heads the labels, ``notes`` hold the definitions printed below.
+
+    ``groups``, where there are any, stand above the columns: one a column, equal neighbours as one heading.
+    """
 
     title: str
     corner: str
     columns: tuple[str, ...]
     rows: tuple[TableRow, ...]
     notes: tuple[str, ...]
+    groups: tuple[str, ...] = ()
+
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """The columns by their full names."""
+        return tuple(f"{group}, {column}" for group, column in zip(self.groups, self.columns)) or self.columns
 
 
 def outfit_table(rows: Sequence[Score], metric: str, view: View = View.VALUE) -> Table:
@@ -198,7 +208,7 @@ def seed_notes(rows: Sequence[Score]) -> list[str]:
 
 def to_markdown(table: Table) -> str:
     """The table as GitHub Markdown: title, table, notes."""
-    lines = [f"**{table.title}**", "", _pipes((table.corner, *table.columns))]
+    lines = [f"**{table.title}**", "", _pipes((table.corner, *table.heads))]
     lines.append("|---" + "|---:" * len(table.columns) + "|")
     for row in table.rows:
         cells = (row.label, *row.cells)
@@ -214,7 +224,7 @@ def to_csv(table: Table) -> str:
     """The table as CSV with full precision, without title and notes; empty where there is no number."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((table.corner, *table.columns))
+    writer.writerow((table.corner, *table.heads))
     writer.writerows((row.label, *("" if v is None else repr(v) for v in row.values)) for row in table.rows)
     return text.getvalue()
 
@@ -223,7 +233,8 @@ def to_latex(table: Table) -> str:
     """The table as a LaTeX ``table`` for booktabs, its notes in the caption."""
     columns = "l" + "r" * len(table.columns)
     head = " & ".join(map(_escape, (table.corner, *table.columns)))
-    lines = ["\\begin{table}", "\\centering", f"\\begin{{tabular}}{{{columns}}}", "\\toprule", f"{head} \\\\"]
+    lines = ["\\begin{table}", "\\centering", f"\\begin{{tabular}}{{{columns}}}", "\\toprule", *_group_lines(table)]
+    lines.append(f"{head} \\\\")
     ruled = None
     for row in table.rows:
         if row.summary != ruled:
@@ -232,6 +243,17 @@ def to_latex(table: Table) -> str:
         lines.append(" & ".join(map(_escape, (row.label, *row.cells))) + " \\\\")
     caption = " ".join(map(_escape, (f"{table.title}.", *table.notes)))
     return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", f"\\caption{{{caption}}}", "\\end{table}", ""])
+
+
+def _group_lines(table: Table) -> list[str]:
+    """The headings above the columns, each with a rule below it."""
+    heads, rules, column = [], [], 2
+    for group, members in groupby(table.groups):
+        width = len(list(members))
+        heads.append(f"\\multicolumn{{{width}}}{{c}}{{{_escape(group)}}}")
+        rules.append(f"\\cmidrule(lr){{{column}-{column + width - 1}}}")
+        column += width
+    return [" & ".join(["", *heads]).strip() + " \\\\", " ".join(rules)] if heads else []
 
 
 LATEX = {

@@ -22,7 +22,7 @@ def some_rows():
 
 
 def cells(table):
-    return {row.label: dict(zip(table.columns, row.values)) for row in table.rows}
+    return {row.label: dict(zip(table.heads, row.values)) for row in table.rows}
 
 
 def test_methods_down_metrics_with_mean_and_max_across_as_in_table_1():
@@ -51,7 +51,7 @@ def test_one_outfit_has_no_summary_and_no_axis_of_its_own_as_in_table_5():
 def test_excess_is_less_the_sampling_floor_of_each_outfit():
     table = form_table(some_rows(), ["cd_point"], FormConfig(), excess=True)
     column = "cd_point (1e-4 m²), pop"
-    assert table.columns == (column,)
+    assert table.heads == (column,)
     found = {label: row[column] for label, row in cells(table).items()}
     assert found == pytest.approx({"dress": 8, "tee": 2, "mean": (30 * 8 + 10 * 2) / 40, "max": 8})
 
