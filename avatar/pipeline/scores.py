@@ -22,7 +22,7 @@ from avatar.io.npz import write_whole
 from avatar.pipeline.methods import is_implicit, load_avatar
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
 from avatar.training.prediction import predict_frames, predict_motion
-from avatar.training.runs import TrainedAvatar
+from avatar.training.runs import RunConfig, TrainedAvatar
 
 
 @dataclass
@@ -128,15 +128,18 @@ def score_runs(config: EvaluateConfig) -> Scores:
         settings = avatar.config
         label = Label(
             settings.method.variant,
+            variant=variant_of(settings),
             seed=settings.train.seed,
             steps=avatar.steps,
             seconds=avatar.seconds,
             commit=current_commit(),
+            fraction=settings.split.train_fraction,
         )
         mine = Scores()
         for outfit in run_outfits(avatar, config.data_root):
             folder = predictions_folder(run, config.split, outfit.name)
-            mine = mine + score_predictions(folder, outfit, config.split, config.score, label)
+            meshes = meshes_folder(run, config.split, outfit.name) if is_implicit(avatar) else None
+            mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes)
             if config.floors and outfit.path not in seen:
                 seen.add(outfit.path)
                 path = settings.runs_root / "floors" / settings.dataset / outfit.name / "scores.csv"
@@ -144,6 +147,16 @@ def score_runs(config: EvaluateConfig) -> Scores:
         write_scores(run / "scores.csv", mine)
         scores = scores + mine
     return scores
+
+
+def variant_of(config: RunConfig) -> str:
+    """What tells a run from its method's usual one: outfits it shares a network with, less data, a canonicalizer."""
+    parts = [f"{len(config.outfit)} outfits"] if len(config.outfit) > 1 else []
+    if config.split.train_fraction < 1:
+        parts.append(f"{100 * config.split.train_fraction:g}%")
+    if config.canonical != "default":
+        parts.append(config.canonical)
+    return ", ".join(parts)
 
 
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
