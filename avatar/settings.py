@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import types
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -61,6 +62,8 @@ def convert_value(hint: Any, value: Any, name: str) -> Any:
         if value is None and type(None) in inner:
             return None
         return convert_value(next(kind for kind in inner if kind is not type(None)), value, name)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise AvatarError(f"{name}: expected a finite number, got {value}.")
     if hint is Any or (isinstance(hint, type) and not is_dataclass(hint) and type(value) is hint):
         return value
     if is_dataclass(hint) and isinstance(value, dict):

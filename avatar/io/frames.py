@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.io.documents import read_json
 from avatar.io.npz import read_arrays, write_arrays, write_whole
 
 QUANTUM = 5e-5  # metres: 0.05 mm
@@ -208,9 +209,9 @@ def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
     folder = Path(folder)
     path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        manifest = read_json(path)
         known = {name: (int(entry["size"]), entry["sha256"]) for name, entry in manifest["files"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise DataError(path, f"expected a manifest, reading failed: {error}.") from error
     if manifest.get("format") != MANIFEST_FORMAT:
         raise DataError(path, f"expected format {MANIFEST_FORMAT}, got {manifest.get('format')}.")

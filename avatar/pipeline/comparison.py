@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from avatar.checks import AvatarError
-from avatar.data.outfits import SAFE_NAME
+from avatar.checks import AvatarError, check_name
 from avatar.evaluation.scores import Scores, read_scores, write_scores
 from avatar.evaluation.tables import View, outfit_table, to_markdown
 from avatar.io.npz import write_whole
@@ -26,8 +25,7 @@ class CompareConfig:
     out: Path = Path("docs/results")
 
     def __post_init__(self):
-        if not SAFE_NAME.fullmatch(self.table):
-            raise AvatarError(f"table: expected a plain name, got {self.table!r}.")
+        check_name("table", self.table)
 
 
 def compare(config: CompareConfig) -> Path:

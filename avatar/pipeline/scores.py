@@ -22,7 +22,7 @@ from avatar.io.npz import write_whole
 from avatar.pipeline.methods import is_implicit, load_avatar
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
 from avatar.training.prediction import predict_frames, predict_motion
-from avatar.training.runs import TrainedAvatar
+from avatar.training.runs import RunConfig, TrainedAvatar
 
 
 @dataclass
@@ -139,11 +139,19 @@ def score_runs(config: EvaluateConfig) -> Scores:
             mine = mine + score_predictions(folder, outfit, config.split, config.score, label)
             if config.floors and outfit.path not in seen:
                 seen.add(outfit.path)
-                path = settings.runs_root / "floors" / settings.dataset / outfit.name / "scores.csv"
+                path = floors_root(run, settings) / "floors" / settings.dataset / outfit.name / "scores.csv"
                 scores = scores + score_floors(outfit, config, mine.rows[-1].points, path)
         write_scores(run / "scores.csv", mine)
         scores = scores + mine
     return scores
+
+
+def floors_root(run: Path, settings: RunConfig) -> Path:
+    """Where the floors of a run's outfits go: the root that it lies in, or its own folder if it was moved.
+
+    What a run's file says of its root is the word of whoever made it, and is believed only where it is true.
+    """
+    return settings.runs_root if settings.folder.resolve() == run.resolve() else run
 
 
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:

@@ -20,10 +20,10 @@ from avatar.canonical.fields import SkinningField, bounding_box
 from avatar.canonical.posed import prepare_scan, to_root_frame
 from avatar.canonical.rivals import KNN, NearestBody, SkinningSource
 from avatar.canonical.scans import STRETCH, canonicalize_scan
-from avatar.checks import AvatarError, DataError
+from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
-from avatar.data.outfits import SAFE_NAME, Outfit
+from avatar.data.outfits import Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.soundness import check_frame_count
 from avatar.data.splits import SplitConfig, split_outfit
@@ -32,6 +32,7 @@ from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
 from avatar.records import CanonicalScan, Frame, Mesh, PointCloud, Template
 from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.training.building import building
 from avatar.training.checkpoints import read_weights, write_weights
 from avatar.training.cycles import CycleConfig, CycleTrainer, find_code
 from avatar.training.runs import choose_device, save_settings
@@ -69,8 +70,8 @@ class CanonicalizeConfig:
     device: str = "auto"  # auto takes CUDA where there is one
 
     def __post_init__(self):
-        if not SAFE_NAME.fullmatch(self.name):
-            raise AvatarError(f"name: expected a plain name (letters, digits, '_', '.', '-'), got {self.name!r}.")
+        for what in ("name", "dataset", "outfit"):
+            check_name(what, getattr(self, what))
         if self.stretch <= 1:
             raise AvatarError(f"stretch: expected above 1, got {self.stretch}.")
         if min(self.pictures, self.scored) < 0:
@@ -172,7 +173,7 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
 def is_trained(config: CanonicalizeConfig) -> bool:
     """Whether a run's canonicalizer is there, sound and trained to its end."""
     try:
-        return read_weights(config.folder / WEIGHTS)[1]["steps"] >= config.train.steps
+        return int(read_weights(config.folder / WEIGHTS, ("steps",))[1]["steps"]) >= config.train.steps
     except DataError:
         return False
 
@@ -186,11 +187,12 @@ def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicaliz
     if not (folder / f"{WEIGHTS}.json").is_file():
         mend = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
         raise DataError(folder, "no trained canonicalizer here.", mend)
-    weights, facts = read_weights(folder / WEIGHTS)
-    config = settings_from_dict(CanonicalizeConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
-    template, poses = read_template(folder / "template.npz"), weights.pop(POSES)
-    model = Canonicalizer(template, len(facts["frames"]), config.canonicalizer)
-    model.load_state_dict(weights)
+    weights, facts = read_weights(folder / WEIGHTS, ("config", "frames", "steps", "seconds"))
+    with building(folder, weights):
+        config = settings_from_dict(CanonicalizeConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
+        template, poses = read_template(folder / "template.npz"), weights.pop(POSES)
+        model = Canonicalizer(template, len(facts["frames"]), config.canonicalizer)
+        model.load_state_dict(weights)
     model = model.to(choose_device(device)).eval().requires_grad_(False)
     return TrainedCanonicalizer(
         model, template, config, tuple(facts["frames"]), poses, facts["steps"], facts["seconds"]

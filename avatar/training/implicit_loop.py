@@ -18,7 +18,7 @@ from avatar.implicit.avatar import ImplicitAvatar
 from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
 from avatar.implicit.probing import ProbeConfig, probe_field, space_points
 from avatar.records import LossTerms
-from avatar.training.checkpoints import load_checkpoint, save_checkpoint
+from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.training.implicit_batches import CanonicalBatch, CanonicalFrames
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
@@ -165,9 +165,10 @@ class ImplicitTrainer:
         """Goes back to the newest sound checkpoint, where there is one."""
         state = load_checkpoint(self.folder / "checkpoints")
         if state is not None:
-            self.model.load_state_dict(state["model"])
-            self.optimiser.load_state_dict(state["optimiser"])
-            self.step, self.seconds = state["step"], state["seconds"]
+            with restoring(self.folder / "checkpoints"):
+                self.model.load_state_dict(state["model"])
+                self.optimiser.load_state_dict(state["optimiser"])
+                self.step, self.seconds = int(state["step"]), float(state["seconds"])
 
 
 def log_values(terms: LossTerms) -> dict[str, float]:

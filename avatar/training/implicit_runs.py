@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -19,14 +18,23 @@ from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig
 from avatar.implicit.body_field import BodyField
+from avatar.io.documents import read_yaml
 from avatar.records import Template
 from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.training.building import building
 from avatar.training.canonical_runs import canonical_outfits, canonicalizer_folder
 from avatar.training.canonicalizing import CanonicalizeConfig, Skinning, load_canonicalizer
-from avatar.training.checkpoints import load_checkpoint, read_weights, write_weights
+from avatar.training.checkpoints import read_weights, write_weights
 from avatar.training.implicit_batches import CanonicalFrame, CanonicalFrames, canonical_frame
 from avatar.training.implicit_loop import ImplicitTrainConfig, ImplicitTrainer
-from avatar.training.runs import WEIGHTS, RunConfig, TrainedAvatar, choose_device, save_settings
+from avatar.training.runs import (
+    WEIGHTS,
+    RunConfig,
+    TrainedAvatar,
+    choose_device,
+    choose_weights,
+    save_settings,
+)
 
 METHOD = "scanimate"  # its name in RunConfig.method
 FIELD = "field."  # how the forward field's weights are named in the avatar's
@@ -101,10 +109,7 @@ def find_field(folder: Path, template: Template) -> nn.Module:
     path = folder / "config.yaml"
     if not path.is_file():
         raise DataError(path, "no such file.", "Run tools/canonicalize.py to its end.")
-    if (
-        settings_from_dict(CanonicalizeConfig, yaml.safe_load(path.read_text()), f"{path}: ").weights
-        is Skinning.learned
-    ):
+    if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is Skinning.learned:
         return load_canonicalizer(folder).forward_field
     return BodyField(template)
 
@@ -140,19 +145,15 @@ def load_implicit(folder: Path, checkpoint: str = "last", device: str = "auto") 
     """
     if checkpoint not in ("last", "best"):
         raise AvatarError(f"checkpoint: expected last or best, got {checkpoint!r}.")
-    weights, facts = read_weights(folder / WEIGHTS)
-    config = settings_from_dict(RunConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
-    if config.method.name != METHOD:
-        raise DataError(folder, f"expected a run of {METHOD}, this is one of {config.method.name}.")
-    steps, seconds = facts["steps"], facts["seconds"]
-    if checkpoint == "best":
-        state = load_checkpoint(folder / "checkpoints", "best")
-        if state is None:
-            raise DataError(folder / "checkpoints", "no best checkpoint: the run held no frames back for validation.")
-        weights, steps, seconds = state["model"], state["step"], state["seconds"]
-    template = read_template(folder / "template.npz")
-    settings = settings_from_dict(ScanimateConfig, config.method.settings, "method.settings.")
-    forward_field = build_field(facts["field"], template, weights)
-    model = ImplicitAvatar(template, forward_field, torch.tensor(facts["box"]), settings.avatar)
-    model.load_state_dict(weights)
+    weights, facts = read_weights(folder / WEIGHTS, ("config", "steps", "seconds", "field", "box"))
+    with building(folder, weights):
+        config = settings_from_dict(RunConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
+        if config.method.name != METHOD:
+            raise DataError(folder, f"expected a run of {METHOD}, this is one of {config.method.name}.")
+        weights, steps, seconds = choose_weights(folder, checkpoint, weights, facts)
+        template = read_template(folder / "template.npz")
+        settings = settings_from_dict(ScanimateConfig, config.method.settings, "method.settings.")
+        forward_field = build_field(facts["field"], template, weights)
+        model = ImplicitAvatar(template, forward_field, torch.tensor(facts["box"]), settings.avatar)
+        model.load_state_dict(weights)
     return TrainedAvatar(model.to(choose_device(device)).eval(), template, config, steps, seconds)
