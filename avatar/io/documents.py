@@ -1,4 +1,4 @@
-"""Settings and descriptions on disk, YAML and JSON: read without trust into plain mappings, of bounded size and depth."""
+"""Settings and descriptions on disk, YAML and JSON: read without trust into plain mappings of bounded size."""
 
 from __future__ import annotations
 
