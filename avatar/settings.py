@@ -48,7 +48,11 @@ def settings_from_dict(kind: type[Settings], values: dict[str, Any], name: str =
                 + (f"Did you mean {near[0]!r}? " if near else "")
                 + f"There are: {', '.join(hints)}."
             )
-    return kind(**{key: convert_value(hints[key], value, f"{name}{key}") for key, value in values.items()})
+    converted = {key: convert_value(hints[key], value, f"{name}{key}") for key, value in values.items()}
+    try:
+        return kind(**converted)
+    except AvatarError as error:  # ranges are checked by the class, which does not know where its options stand
+        raise AvatarError(f"{name}{error}") from error
 
 
 def convert_value(hint: Any, value: Any, name: str) -> Any:

@@ -17,7 +17,7 @@ from avatar.training.checkpoints import restoring
 
 ROOM = 4  # times the numbers in a weights file: initialisation makes temporaries of a layer's size
 SPARE = 1 << 24  # numbers beside them, 64 MiB: what a network draws, sorts and caches of its template
-FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.eye, torch.arange}
+FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.eye}
 
 
 class Budget(TorchFunctionMode):
@@ -30,7 +30,7 @@ class Budget(TorchFunctionMode):
     def __torch_function__(self, function: Any, types: Any, arguments: tuple = (), options: dict | None = None) -> Any:
         options = options or {}
         if function in FACTORIES:
-            given = options.get("size", arguments)
+            given = options.get("size", arguments[:1] if function is torch.full else arguments)
             sizes = [size for part in given for size in (part if isinstance(part, (tuple, list)) else [part])]
             asked = math.prod(int(size) for size in sizes if isinstance(size, int))
             self.left -= asked

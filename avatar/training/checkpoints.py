@@ -47,8 +47,8 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
         AvatarError: when the state holds a number that is not finite; nothing is written then.
         DataError: when the disk refuses, saying how much room was needed and what there is still.
     """
-    for name, value in _tensors(state):
-        if value.is_floating_point() and not torch.isfinite(value).all():
+    for name, value in named_tensors(state):
+        if not _is_finite(value):
             raise AvatarError(f"{name}: expected finite weights at step {step}; this checkpoint was not written.")
     best = best if best is not None and math.isfinite(best) else None
     buffer = io.BytesIO()
@@ -75,13 +75,17 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
     return folder / entry["file"]
 
 
-def _tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
+def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
     """Every tensor in nested dicts and lists, with its name."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, (dict, list, tuple)):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _tensors(item, f"{name}.{key}" if name else str(key))
+            yield from named_tensors(item, f"{name}.{key}" if name else str(key))
+
+
+def _is_finite(value: Tensor) -> bool:
+    return not value.is_floating_point() or bool(torch.isfinite(value).all())
 
 
 def _not_written(folder: Path, error: OSError, needed: int, before: dict[str, Any]) -> DataError:
@@ -156,7 +160,8 @@ def _read_sound(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception:  # the hash of a hostile file can be right: what it makes torch raise may be anything
         return None
-    return state if isinstance(state, dict) and "score" in state else None
+    sound = isinstance(state, dict) and "score" in state and all(_is_finite(value) for _, value in named_tensors(state))
+    return state if sound else None
 
 
 @contextmanager
@@ -206,7 +211,7 @@ def write_weights(path: Path, weights: dict[str, Tensor], description: dict[str,
         AvatarError: when a weight is not finite; nothing is written then.
     """
     for name, value in weights.items():
-        if value.is_floating_point() and not torch.isfinite(value).all():
+        if not _is_finite(value):
             raise AvatarError(f"{name}: expected finite weights; {path}.safetensors was not written.")
     data = save_tensors({name: value.contiguous().cpu() for name, value in weights.items()})
     described = description | {"sha256": hashlib.sha256(data).hexdigest()}
