@@ -272,6 +272,11 @@ def make_weights(folder: Path) -> Path:
     return folder / "avatar.safetensors"
 
 
+def read_shared(path: Path) -> Any:
+    """Weights to share, as whoever loads a run reads them."""
+    return read_weights(path.with_suffix(""))
+
+
 def respoil_weights(data: bytes, rng: random.Random) -> bytes:
     """Weights with a number that is none; `fuzzing` describes them with their right hash."""
     spoilt = bytearray(data)
@@ -302,24 +307,9 @@ def respoil_config(data: bytes, rng: random.Random) -> bytes:
         if not isinstance(at[key], dict) or not at[key] or rng.random() < 0.1:
             break
         at = at[key]
-    weird = [
-        "../../etc",
-        "/etc/passwd",
-        [],
-        {},
-        None,
-        -1,
-        0,
-        10**40,
-        float("nan"),
-        float("inf"),
-        True,
-        "x" * 300,
-        [[[]]],
-    ]
-    at[key] = rng.choice(
-        [*weird, *(number.decode() for number in NUMBERS), {"_target_": "os.system", "_args_": ["id"]}]
-    )
+    weird: list[Any] = ["../../etc", "/etc/passwd", "x" * 300, [], {}, [[[]]], None, True, -1, 0, 10**40]
+    weird += [float("nan"), float("inf"), {"_target_": "os.system", "_args_": ["id"]}]
+    at[key] = rng.choice([*weird, *(number.decode() for number in NUMBERS)])
     return yaml.safe_dump(values, sort_keys=False).encode()
 
 
@@ -427,9 +417,7 @@ def judge_weights(read: tuple[dict[str, torch.Tensor], dict[str, Any]]) -> str:
 def judge_config(config: RunConfig) -> str:
     """Settings: plain names, finite numbers of the declared kinds."""
     names = [config.name, config.dataset, config.method.variant, config.canonical, *config.outfit]
-    if not all(
-        isinstance(name, str) and name and not set(name) & set("/\\\0~ \n") and name[0] != "." for name in names
-    ):
+    if any(type(name) is not str or not name or name[0] == "." or set(name) & set("/\\\0~ \n") for name in names):
         return "unsafe name"
     train = config.train
     whole = (train.steps, train.batch, train.points, train.scan_points, train.seed)
@@ -470,8 +458,6 @@ FORMATS = {
     "SMPL npz": Format(make_model(".npz"), convert, judge_body, respoil_arrays),
     "BVH": Format(make_bvh, read_bvh, judge_bvh),
     "checkpoint": Format(make_checkpoint, read_checkpoint, judge_state, respoil_checkpoint),
-    "safetensors": Format(
-        make_weights, lambda path: read_weights(path.with_suffix("")), judge_weights, respoil_weights
-    ),
+    "safetensors": Format(make_weights, read_shared, judge_weights, respoil_weights),
     "config yaml": Format(make_config, read_config, judge_config, respoil_config),
 }

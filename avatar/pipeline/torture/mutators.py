@@ -1,4 +1,4 @@
-"""Five ways to spoil a file, from blind to knowing: bits, bytes, pieces, numbers, and the values inside a sound container."""
+"""Five ways to spoil a file: its bits, bytes, pieces, numbers in digits, and the values in a sound container."""
 
 from __future__ import annotations
 
@@ -37,10 +37,8 @@ def cut_and_splice(data: bytes, rng: random.Random) -> bytes:
     length = rng.choice((rng.randint(1, 64), rng.randint(1, len(data))))
     piece, rest = data[start : start + length], data[:start] + data[start + length :]
     where = rng.randrange(len(rest) + 1)
-    return rng.choice(
-        (rest, data[:start] + piece + piece + data[start + length :], data[:start])
-        + (rest[:where] + piece + rest[where:],)
-    )
+    doubled, moved = data[:start] + piece + data[start:], rest[:where] + piece + rest[where:]
+    return rng.choice((rest, doubled, moved, data[:start]))
 
 
 def set_numbers(data: bytes, rng: random.Random) -> bytes:

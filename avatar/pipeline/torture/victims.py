@@ -1,4 +1,4 @@
-"""Processes to be killed, crashed and filled: real ones, forked, so that a hundred of them do not import a hundred times."""
+"""Processes to be killed, crashed and starved: real ones, forked, so that they need not import all anew."""
 
 from __future__ import annotations
 
