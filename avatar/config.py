@@ -33,6 +33,7 @@ from avatar.pipeline.outcomes import State, ask_to_stop, is_stopping, note_outco
 from avatar.pipeline.reporting import ReportConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig
+from avatar.pipeline.torture.trials import TortureConfig
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.simulate.recording import SimulateConfig
 from avatar.training.canonicalizing import CanonicalizeConfig
@@ -54,6 +55,7 @@ VERBS = {
     "report": ReportConfig,
     "demo": DemoConfig,
     "simulate": SimulateConfig,
+    "torture": TortureConfig,
 }
 Settings = TypeVar("Settings")
 

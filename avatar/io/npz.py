@@ -15,6 +15,8 @@ from avatar.checks import AvatarError, DataError, check_finite, check_shape
 
 SIZE_LIMIT = 4 << 30  # bytes of arrays in one file, unpacked
 MEMBER_LIMIT = 200
+SWELLING = 100  # arrays of measured things deflate ten times at most; zeros, a thousand times
+SMALL = 16 << 20  # bytes unpacked that nobody needs to look at
 DTYPE_KINDS = {"float": "f", "int": "iu", "bool": "b", "text": "U", "number": "fiu"}
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # one time stamp for all members, so that equal arrays give equal bytes
@@ -65,7 +67,9 @@ def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipf
     infos = archive.infolist()
     if len(infos) > MEMBER_LIMIT:
         raise DataError(path, f"expected at most {MEMBER_LIMIT} arrays, found {len(infos)}.")
-    total = sum(info.file_size for info in infos)
+    total, packed = (sum(getattr(info, of) for info in infos) for of in ("file_size", "compress_size"))
+    if total > max(SMALL, SWELLING * packed):
+        raise DataError(path, f"expected arrays, it swells from {packed} bytes to {total} on unpacking: not read.")
     if total > limit:
         raise DataError(path, f"expected at most {limit} bytes of arrays, it declares {total}.")
     members = {info.filename.removesuffix(".npy"): info for info in infos}

@@ -322,8 +322,7 @@ def judge_mesh(mesh: Mesh) -> str:
         return "indices out of range"
     a, b = vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
     gram = (a * a).sum(axis=1) * (b * b).sum(axis=1) - (a * b).sum(axis=1) ** 2
-    scale = (a * a).sum(axis=1) * (b * b).sum(axis=1)
-    return "" if (gram > -1e-9 * scale).all() and (scale > 0).any() else "no area"
+    return "" if (gram > 0).any() else "no area"
 
 
 def judge_points(points: PointCloud) -> str:
