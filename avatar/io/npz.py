@@ -154,9 +154,21 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Writes a file atomically: a temporary file beside it, flushed, then renamed. Makes its folder."""
+    """Writes a file atomically: a temporary file beside it, flushed, then renamed. Makes its folder.
+
+    Raises:
+        DataError: when the disk refuses, its cause the `OSError`; the file that was there before is there still.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _replace(path, data)
+    except OSError as error:
+        mend = "Make room and give the same command again."
+        raise DataError(path, f"could not be written ({error.strerror}; {len(data):,} bytes).", mend) from error
+
+
+def _replace(path: Path, data: bytes) -> None:
     part = path.with_name(f".{path.name}.tmp-{os.getpid()}")
     try:
         with part.open("wb") as stream:

@@ -66,8 +66,8 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
     try:
         write_whole(folder / entry["file"], data)
         write_whole(folder / MANIFEST, _seal(entries))
-    except OSError as error:
-        raise _not_written(folder, error, len(data), before) from error
+    except DataError as error:
+        raise _not_written(folder, error.__cause__, len(data), before) from error
     listed = {kept["file"] for kept in (*entries["last"], entries.get("best", entry))}
     for path in (*folder.glob("step-*.pt"), *folder.glob(".*.tmp-*")):
         if path.name not in listed:
@@ -88,12 +88,12 @@ def _is_finite(value: Tensor) -> bool:
     return not value.is_floating_point() or bool(torch.isfinite(value).all())
 
 
-def _not_written(folder: Path, error: OSError, needed: int, before: dict[str, Any]) -> DataError:
+def _not_written(folder: Path, error: BaseException | None, needed: int, before: dict[str, Any]) -> DataError:
     free = shutil.disk_usage(folder if folder.is_dir() else ".").free
     kept = f"step {before['last'][-1]['step']}" if before.get("last") else "none"
     return DataError(
         folder,
-        f"could not write a checkpoint ({error.strerror}; {needed:,} bytes needed, {free:,} free). "
+        f"could not write a checkpoint ({getattr(error, 'strerror', error)}; {needed:,} bytes needed, {free:,} free). "
         f"The last one written: {kept}.",
         "Make room and give the same command again.",
     )

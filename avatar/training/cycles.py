@@ -112,7 +112,7 @@ class CycleTrainer:
                     values["lr"] = self.optimiser.param_groups[0]["lr"]
                     log.write("train", self.step, self.epoch(), self.seconds, values)
                     bar.set_postfix(loss=f"{values['loss']:.3f}", cycle=f"{1e3 * values.get('cycle_points', 0):.1f}mm")
-                if self.step % config.save_every == 0 or done or stopping:
+                if (self.step % config.save_every == 0 and not self.bad_steps) or done or stopping:
                     save_checkpoint(self.folder / "checkpoints", self.state(), self.step)
                 if stopping and not done:
                     stop.leave(self.folder)

@@ -98,7 +98,8 @@ class ImplicitTrainer:
                     values = self.validate(held_back.ordered())
                     log.write("validation", self.step, epoch, self.seconds, values)
                     score = values["surface"]
-                if self.due(self.config.save_every) or score is not None or stop.number is not None:
+                worth = (self.due(self.config.save_every) or score is not None) and not self.bad_steps
+                if worth or self.progress() >= 1 or stop.number is not None:
                     save_checkpoint(self.folder / "checkpoints", self.state(), self.step, score)
             bar.close()
             log.close()

@@ -159,7 +159,11 @@ class Trainer:
                     score = values.get("chamfer")
                     if log and values:
                         log.write("validation", self.step, epoch, self.seconds, values)
-                if self.step % config.save_every == 0 or score is not None or done or stopping:
+                if (
+                    ((self.step % config.save_every == 0 or score is not None) and not self.bad_steps)
+                    or done
+                    or stopping
+                ):
                     self.save(score)
                 if stopping and not done:
                     stop.leave(self.folder)

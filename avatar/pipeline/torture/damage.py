@@ -10,18 +10,15 @@ from typing import Any
 
 from avatar.checks import DataError
 from avatar.pipeline.torture.findings import Finding, all_of, none_of
-from avatar.pipeline.torture.killing import prepare_alone
-from avatar.pipeline.torture.miniature import folder_of, train_job
-from avatar.pipeline.torture.victims import run_victim
+from avatar.pipeline.torture.miniature import folder_of, prepare, train_job
+from avatar.pipeline.torture.victims import work_alone
 from avatar.training.checkpoints import load_checkpoint, named_tensors, read_manifest, read_weights
 
 
 def flip_trial(root: Path, flips: int, truncations: int, seed: int) -> list[Finding]:
     """Damages the newest checkpoint of a real run, and its weights to share, one bit or one cut at a time."""
-    prepare_alone(root)
-    outcome = run_victim(train_job, "closet", root, "damaged")
-    if outcome.code:
-        raise RuntimeError(outcome.crash or outcome.error)
+    work_alone(prepare, root)
+    work_alone(train_job, "closet", root, "damaged")
     folder, rng = folder_of("closet", root, "damaged"), random.Random(seed)
     checkpoints = folder / "checkpoints"
     newest, before = (checkpoints / entry["file"] for entry in reversed(read_manifest(checkpoints)["last"]))

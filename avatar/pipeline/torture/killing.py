@@ -13,7 +13,7 @@ from typing import Any
 
 from avatar.pipeline.torture.findings import Finding, all_of
 from avatar.pipeline.torture.miniature import JOBS, SAVE_EVERY, STEPS, folder_of, prepare, train_job, weights_digest
-from avatar.pipeline.torture.victims import Victim, run_victim, wait_until
+from avatar.pipeline.torture.victims import Victim, run_victim, wait_until, work_alone
 from avatar.training.checkpoints import read_manifest
 from avatar.training.logs import read_log
 
@@ -30,12 +30,12 @@ def kill_trial(root: Path, kills: int, in_saves: int, seed: int) -> list[Finding
             spread at random over the whole of a training.
         seed: of the moments.
     """
-    prepare_alone(root)
+    work_alone(prepare, root)
     rng = random.Random(seed)
     whole, length = {}, {}
     for job in JOBS:
         started = time.monotonic()
-        assert run_victim(train_job, job, root, "whole").code == 0
+        work_alone(train_job, job, root, "whole")
         length[job], whole[job] = time.monotonic() - started, weights_digest(folder_of(job, root, "whole"))
     killed = resumed = equal = saving = 0
     lost = 0
@@ -65,13 +65,6 @@ def kill_trial(root: Path, kills: int, in_saves: int, seed: int) -> list[Finding
         all_of("kill", "final weights equal to the uninterrupted run's, by sha256", equal, kills),
         Finding("kill", "steps to do again at most (saved every 4)", lost, "steps", kills, None, SAVE_EVERY),
     ]
-
-
-def prepare_alone(root: Path) -> None:
-    """Prepares the miniature in a process of its own, so that this one stays free of threads."""
-    outcome = run_victim(prepare, root)
-    if outcome.code:
-        raise RuntimeError(outcome.crash or outcome.error)
 
 
 def train_until_save(job: str, root: Path, name: str, place: int) -> None:

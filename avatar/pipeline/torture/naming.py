@@ -21,9 +21,16 @@ from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.scores import PredictConfig, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
 from avatar.pipeline.torture.findings import Finding, none_of
-from avatar.pipeline.torture.killing import prepare_alone
-from avatar.pipeline.torture.miniature import DATASET, OUTFIT, canonicalizer_config, folder_of, run_config, train_job
-from avatar.pipeline.torture.victims import run_victim
+from avatar.pipeline.torture.miniature import (
+    DATASET,
+    OUTFIT,
+    canonicalizer_config,
+    folder_of,
+    prepare,
+    run_config,
+    train_job,
+)
+from avatar.pipeline.torture.victims import work_alone
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.checkpoints import load_checkpoint
 from avatar.training.fitting import FitConfig
@@ -50,14 +57,12 @@ def hostile_names(count: int, seed: int) -> list[str]:
 
 def name_trial(root: Path, count: int, seed: int) -> list[Finding]:
     """Gives every name to every door, in a process whose every write is heard by the interpreter's own audit hook."""
-    prepare_alone(root)
-    outcome = run_victim(train_job, "closet", root, "named")
+    work_alone(prepare, root)
+    work_alone(train_job, "closet", root, "named")
     names = hostile_names(count, seed)
-    outcome = run_victim(try_names, root, names)
-    if outcome.value is None:
-        raise RuntimeError(outcome.crash or outcome.error or f"exit code {outcome.code}")
-    (root / "names.json").write_text(json.dumps(outcome.value, indent=1))
-    outside, untyped = (len(outcome.value[key]) for key in ("outside", "untyped"))
+    found = work_alone(try_names, root, names, timeout=3600)
+    (root / "names.json").write_text(json.dumps(found, indent=1))
+    outside, untyped = (len(found[key]) for key in ("outside", "untyped"))
     return [
         none_of("names", "names by which anything was written outside the roots", outside, count),
         none_of("names", "that ended in another error than ours", untyped, count),

@@ -1,4 +1,4 @@
-"""`nan`: numbers that are none in losses, gradients, scans and weights; none may reach the disk."""
+"""`poison`: numbers that are none in losses, gradients, scans and weights; none may reach the disk."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from avatar.pipeline.torture.findings import Finding, all_of, none_of
-from avatar.pipeline.torture.killing import prepare_alone
-from avatar.pipeline.torture.miniature import JOBS, STEPS, folder_of, train_job, weights_digest
-from avatar.pipeline.torture.victims import run_victim
+from avatar.pipeline.torture.miniature import JOBS, STEPS, folder_of, prepare, train_job, weights_digest
+from avatar.pipeline.torture.victims import run_victim, work_alone
 from avatar.training import cycles, implicit_loop, loop
 from avatar.training.checkpoints import named_tensors
 
@@ -30,14 +29,12 @@ LOSSES = (
 )
 
 
-def nan_trial(root: Path, poisons: int, seed: int) -> list[Finding]:
+def poison_trial(root: Path, poisons: int, seed: int) -> list[Finding]:
     """Poisons miniature trainings of all four kinds, in four places, at one step or from there on."""
-    prepare_alone(root)
+    work_alone(prepare, root)
     whole = {}
     for job in JOBS:
-        outcome = run_victim(train_job, job, root, "whole")
-        if outcome.code:
-            raise RuntimeError(outcome.crash or outcome.error)
+        work_alone(train_job, job, root, "whole")
         whole[job] = weights_digest(folder_of(job, root, "whole"))
     rng = random.Random(seed)
     cases = list(product(JOBS, PLACES, (False, True)))  # the last: once, or from then on
@@ -55,10 +52,10 @@ def nan_trial(root: Path, poisons: int, seed: int) -> list[Finding]:
             run_victim(train_job, job, root, name)
             equal += weights_digest(folder) == whole[job]
     return [
-        all_of("nan", "poisoned steps that left all other weights as they were", caught, poisons),
-        all_of("nan", "trainings that went on or ended with a named error", ended, poisons),
-        none_of("nan", "runs with a number on disk that is none", written, poisons),
-        all_of("nan", "of those that ended, finished from the last checkpoint as if unpoisoned", equal, lasting),
+        all_of("poison", "poisoned steps that left all other weights as they were", caught, poisons),
+        all_of("poison", "trainings that went on or ended with a named error", ended, poisons),
+        none_of("poison", "runs with a number on disk that is none", written, poisons),
+        all_of("poison", "of those that ended, finished from the last checkpoint as if unpoisoned", equal, lasting),
     ]
 
 

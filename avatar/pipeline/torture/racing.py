@@ -8,17 +8,14 @@ from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
 from avatar.pipeline.torture.findings import Finding, all_of
-from avatar.pipeline.torture.killing import prepare_alone
-from avatar.pipeline.torture.miniature import folder_of, train_job, weights_digest
-from avatar.pipeline.torture.victims import Victim, run_victim
+from avatar.pipeline.torture.miniature import folder_of, prepare, train_job, weights_digest
+from avatar.pipeline.torture.victims import Victim, work_alone
 
 
 def race_trial(root: Path, races: int) -> list[Finding]:
     """Lets two processes train the same run from the same moment on, again and again."""
-    prepare_alone(root)
-    outcome = run_victim(train_job, "closet", root, "whole")
-    if outcome.code:
-        raise RuntimeError(outcome.crash or outcome.error)
+    work_alone(prepare, root)
+    work_alone(train_job, "closet", root, "whole")
     whole = weights_digest(folder_of("closet", root, "whole"))
     one = equal = 0
     for race in range(races):

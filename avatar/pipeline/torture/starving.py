@@ -13,9 +13,8 @@ from pathlib import Path
 
 from avatar.pipeline.torture.damage import digest, load_quietly
 from avatar.pipeline.torture.findings import Finding, all_of
-from avatar.pipeline.torture.killing import prepare_alone
-from avatar.pipeline.torture.miniature import JOBS, SAVE_EVERY, folder_of, train_job, weights_digest
-from avatar.pipeline.torture.victims import run_victim
+from avatar.pipeline.torture.miniature import JOBS, SAVE_EVERY, folder_of, prepare, train_job, weights_digest
+from avatar.pipeline.torture.victims import run_victim, work_alone
 from avatar.training import cycles, implicit_loop, loop
 
 DISK_BYTES = 64 << 20
@@ -30,12 +29,10 @@ def disk_trial(root: Path, points: int, seed: int) -> list[Finding]:
     rng = random.Random(seed)
     with small_disk(root / "disk") as mounted:
         place = root / "disk"
-        prepare_alone(place)
+        work_alone(prepare, place)
         whole, sizes = {}, {}
         for job in JOBS:
-            outcome = run_victim(train_job, job, place, "whole")
-            if outcome.code:
-                raise RuntimeError(outcome.crash or outcome.error)
+            work_alone(train_job, job, place, "whole")
             whole[job] = weights_digest(folder_of(job, place, "whole"))
             sizes[job] = max(path.stat().st_size for path in folder_of(job, place, "whole").rglob("step-*.pt"))
         kept = told = equal = 0

@@ -17,7 +17,7 @@ from avatar.io.npz import write_whole
 from avatar.pipeline.methods import train
 from avatar.pipeline.torture.findings import Finding
 from avatar.pipeline.torture.miniature import run_config, write_data
-from avatar.pipeline.torture.victims import peak_memory, run_victim
+from avatar.pipeline.torture.victims import peak_memory, work_alone
 
 SCAN_POINTS = 400_000
 LIMIT = 2 << 30  # bytes resident
@@ -31,17 +31,12 @@ def stream_trial(root: Path, gigabytes: float, visited: int) -> list[Finding]:
     they are links to one file, for the reader cannot tell and the disk need not be large.
     """
     folder = root / "data" / "packed" / "large"
-    size = run_victim(write_large_outfit, root, folder, gigabytes)
-    if size.code:
-        raise RuntimeError(size.crash or size.error)
-    outcome = run_victim(train_on_stream, root, visited, timeout=3600)
-    if outcome.code:
-        raise RuntimeError(outcome.crash or outcome.error)
-    frames = size.value["frames"]
+    size = work_alone(write_large_outfit, root, folder, gigabytes)
+    peak, frames = work_alone(train_on_stream, root, visited, timeout=3600), size["frames"]
     return [
-        Finding("stream", "size of the outfit's frames as arrays", size.value["gigabytes"], "GB", frames, gigabytes),
+        Finding("stream", "size of the outfit's frames as arrays", size["gigabytes"], "GB", frames, gigabytes),
         Finding("stream", "frames read while training", visited, f"of {frames}", frames, visited),
-        Finding("stream", "peak resident memory", round(outcome.value / 2**20), "MiB", frames, None, LIMIT / 2**20),
+        Finding("stream", "peak resident memory", round(peak / 2**20), "MiB", frames, None, LIMIT / 2**20),
     ]
 
 

@@ -29,9 +29,8 @@ from avatar.io.points import read_points
 from avatar.pipeline.methods import load_avatar
 from avatar.pipeline.torture.findings import Finding, all_of
 from avatar.pipeline.torture.formats import BVH, smpl_arrays
-from avatar.pipeline.torture.killing import prepare_alone
-from avatar.pipeline.torture.miniature import DECODER, folder_of, train_job
-from avatar.pipeline.torture.victims import peak_memory, run_victim
+from avatar.pipeline.torture.miniature import DECODER, folder_of, prepare, train_job
+from avatar.pipeline.torture.victims import peak_memory, run_victim, work_alone
 from avatar.training.checkpoints import load_checkpoint, read_weights
 
 MOST = 64  # MiB that a refusal may take
@@ -133,9 +132,7 @@ def corpus() -> dict[str, Bomb]:
             "template.npz", deflated("vertices", "<f4", (1 << 28, 3), 0), packed_body
         ),
         "npz of zeros": file_bomb("motion.npz", deflated("trans", "<f4", (1 << 24, 3), 192), read_motion),
-        "npz frame of zeros": file_bomb(
-            "frame.npz", deflated("cloth_high", "|u1", (3, 40 << 20), 120), read_open_frame
-        ),
+        "npz of zeros, a frame": file_bomb("f.npz", deflated("cloth_high", "|u1", (3, 40 << 20), 120), read_open_frame),
         "npz of many members": file_bomb("model.npz", crowded_npz(), convert_and_drop),
         "pickle memo": file_bomb("model.pkl", memo, convert_and_drop),
         "pickle length": file_bomb("model.pkl", long_bytes, convert_and_drop),
@@ -179,14 +176,12 @@ def convert_and_drop(path: Path) -> Any:
 
 def bomb_trial(root: Path) -> list[Finding]:
     """Reads every bomb in a process of its own and looks at what its refusal took."""
-    prepare_alone(root)
-    outcome = run_victim(train_job, "closet", root, "sound")
-    if outcome.code:
-        raise RuntimeError(outcome.crash or outcome.error)
+    work_alone(prepare, root)
+    work_alone(train_job, "closet", root, "sound")
     folder, bombs = root / "bombs", corpus()
     shutil.rmtree(folder, ignore_errors=True)
     refused, most = 0, 0.0
-    for number, (name, write) in enumerate(bombs.items()):
+    for number, write in enumerate(bombs.values()):
         (folder / str(number)).mkdir(parents=True)
         outcome = run_victim(measure_refusal, write(folder / str(number)), timeout=60)
         refused += outcome.value is not None and outcome.value["refused"]

@@ -23,7 +23,7 @@ from avatar.pipeline.torture.killing import kill_trial
 from avatar.pipeline.torture.naming import name_trial
 from avatar.pipeline.torture.offline import network_trial
 from avatar.pipeline.torture.payloads import payload_trial
-from avatar.pipeline.torture.poisoning import nan_trial
+from avatar.pipeline.torture.poisoning import poison_trial
 from avatar.pipeline.torture.racing import race_trial
 from avatar.pipeline.torture.soaking import mesh_trial
 from avatar.pipeline.torture.starving import disk_trial
@@ -73,7 +73,7 @@ TRIALS: dict[str, tuple[tuple[str, ...], Callable[[TortureConfig, Path], list[Fi
     "kill": (("kills", "kills_in_saves"), lambda c, root: kill_trial(root, c.kills, c.kills_in_saves, c.seed)),
     "flips": (("flips", "truncations"), lambda c, root: flip_trial(root, c.flips, c.truncations, c.seed)),
     "disk": (("full_disks",), lambda c, root: disk_trial(root, c.full_disks, c.seed)),
-    "nan": (("poisons",), lambda c, root: nan_trial(root, c.poisons, c.seed)),
+    "poison": (("poisons",), lambda c, root: poison_trial(root, c.poisons, c.seed)),
     "race": (("races",), lambda c, root: race_trial(root, c.races)),
     "fuzz": (("files",), lambda c, root: fuzz_trial(root, c.files, c.seed)),
     "bombs": ((), lambda c, root: bomb_trial(root)),
@@ -103,10 +103,10 @@ def torture(config: TortureConfig) -> Path:
             log.info("%s: done before.", name)
             continue
         log.info("%s: %s", name, ", ".join(f"{key}={value}" for key, value in counts.items()))
-        started = time.monotonic()
+        started, commit = time.monotonic(), current_commit()
         findings = trial(config, root / name)
         seconds = time.monotonic() - started
-        told = {"counts": counts, "seconds": seconds, "commit": current_commit()}
+        told = {"counts": counts, "seconds": seconds, "commit": commit}
         write_whole(done, json.dumps(told | {"findings": [asdict(f) for f in findings]}, indent=1).encode())
         log.info("%s", to_table(findings))
     return write_table(config)

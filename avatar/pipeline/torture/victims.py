@@ -81,13 +81,25 @@ def _serve(far: Connection, log: Path | None, function: Callable[..., Any], argu
         answer = {"error": str(error)}
     except BaseException:
         answer = {"crash": traceback.format_exc()}
-    far.send_bytes(json.dumps(answer).encode())
+    far.send_bytes(json.dumps(answer, default=str).encode())
     os._exit(0 if "value" in answer else 2 if "error" in answer else CRASH)
 
 
 def run_victim(function: Callable[..., Any], *arguments: Any, timeout: float = 600.0) -> Outcome:
     """Calls a function in a process of its own."""
     return Victim(function, *arguments).end(timeout)
+
+
+def work_alone(function: Callable[..., Any], *arguments: Any, timeout: float = 600.0) -> Any:
+    """What a function gives in a process of its own, so that this one stays free of threads and of what it loads.
+
+    Raises:
+        RuntimeError: when it fails: a trial's own work must not.
+    """
+    outcome = run_victim(function, *arguments, timeout=timeout)
+    if outcome.code:
+        raise RuntimeError(outcome.crash or outcome.error or f"{function.__name__}: exit code {outcome.code}")
+    return outcome.value
 
 
 def peak_memory() -> int:
