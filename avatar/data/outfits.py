@@ -13,6 +13,7 @@ import numpy as np
 from avatar.checks import SAFE_NAME, AvatarError, DataError, check_name
 from avatar.data.soundness import check_frame, check_template
 from avatar.io.documents import read_yaml
+from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Scan, Template
 
 SPLITS = ("train", "test")
@@ -73,6 +74,15 @@ class Outfit(ABC):
             near = difflib.get_close_matches(name, names, n=3) or names[:3]
             raise AvatarError(f"frame: {self.name} has no {split} frame {name!r}; there are {', '.join(near)}, ...")
         return self.path / split / f"{name}.npz"
+
+    def digest(self, split: str, name: str) -> str:
+        """One hash over all of a frame on the disk: its file, and the files that the outfit's frames share."""
+        return digest_of([file_digest(self.frame_path(split, name)), self.shared_digest])
+
+    @cached_property
+    def shared_digest(self) -> str:
+        """One hash over the files that the outfit's frames share."""
+        return files_digest(self.path)
 
     @abstractmethod
     def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:

@@ -17,7 +17,8 @@ import numpy as np
 from avatar.checks import INSTALL_LINES, AvatarError, DataError, check_finite, check_shape, require
 from avatar.export.poisson import FAILED, READY, SOLVED, serve
 from avatar.export.trimming import trim_surface
-from avatar.io.meshes import FORMATS, check_mesh, read_mesh, write_mesh
+from avatar.io.ledger import Ledger, file_digest, keyed
+from avatar.io.meshes import FORMATS, check_mesh, write_mesh
 from avatar.io.points import read_points
 from avatar.records import Mesh, PointCloud
 
@@ -218,8 +219,8 @@ def mesh_folder(
 ) -> MeshingReport:
     """Meshes the point clouds ``<name>.ply`` of one folder into ``<name>.<format>`` in another.
 
-    Sound meshes newer than their cloud are kept, so that an interrupted run goes on where it stopped. A frame
-    that fails does not stop the others; it is in the report with its reason.
+    Meshes made of the same cloud with the same settings are kept where their hashes are right, so that an interrupted
+    run goes on where it stopped. A frame that fails does not stop the others; it is in the report with its reason.
 
     Args:
         predictions_dir: folder of oriented point clouds.
@@ -243,12 +244,15 @@ def mesh_folder(
     if not names or missing:
         what = f"no point clouds named {', '.join(missing)}" if missing else "no point clouds (*.ply)"
         raise DataError(predictions_dir, f"{what} in this folder.", "Run tools/predict.py first.")
-    done, skipped, failed = [], [], {}
+    done, skipped, failed, ledger = [], [], {}, Ledger(meshes_dir)
+    settings = config or PoissonConfig()
     with PoissonMesher(config) as mesher:
         for name in require("tqdm").tqdm(names, desc="meshing", unit="frame"):
             source = predictions_dir / f"{name}.ply"
             targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
-            if all(_is_fresh(target, source) for target in targets):
+            made = [getattr(settings, option) for option in ("depth", "max_hole", "min_part")]
+            key = keyed(cloud=file_digest(source), formats=formats, poisson=made)
+            if ledger.find(name, key):
                 skipped.append(name)
                 continue
             try:
@@ -258,16 +262,6 @@ def mesh_folder(
                 continue
             for target in targets:
                 write_mesh(target, mesh)
+            ledger.record(name, key, targets)
             done.append(name)
     return MeshingReport(tuple(done), tuple(skipped), failed, time.monotonic() - started)
-
-
-def _is_fresh(target: Path, source: Path) -> bool:
-    """Whether a mesh is there, newer than its cloud, and sound."""
-    if not target.is_file() or target.stat().st_mtime_ns < source.stat().st_mtime_ns:
-        return False
-    try:
-        read_mesh(target)
-    except DataError:
-        return False
-    return True

@@ -17,6 +17,7 @@ from avatar.evaluation.scores import Scores, read_scores, write_scores
 from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
 from avatar.implicit.extraction import ExtractionConfig
+from avatar.io.ledger import Ledger
 from avatar.io.motions import read_motion
 from avatar.io.npz import write_whole
 from avatar.pipeline.methods import is_implicit, load_avatar
@@ -110,7 +111,8 @@ def evaluate(config: EvaluateConfig) -> Scores:
     if config.predictions is not None:
         outfit = find_outfit(config.data_root or Path("data"), config.dataset, config.outfit)
         folder = config.out or config.predictions
-        scores = score_predictions(config.predictions, outfit, config.split, config.score, Label(config.method))
+        label, done = Label(config.method), Ledger(folder)
+        scores = score_predictions(config.predictions, outfit, config.split, config.score, label, None, done)
         write_scores(folder / "scores.csv", scores)
         if config.floors:
             scores = score_floors(outfit, config, 50_000, folder / "floors.csv") + scores
@@ -136,7 +138,8 @@ def score_runs(config: EvaluateConfig) -> Scores:
         mine = Scores()
         for outfit in run_outfits(avatar, config.data_root):
             folder = predictions_folder(run, config.split, outfit.name)
-            mine = mine + score_predictions(folder, outfit, config.split, config.score, label)
+            done = Ledger(run / "predictions")
+            mine = mine + score_predictions(folder, outfit, config.split, config.score, label, None, done)
             if config.floors and outfit.path not in seen:
                 seen.add(outfit.path)
                 path = floors_root(run, settings) / "floors" / settings.dataset / outfit.name / "scores.csv"
@@ -165,9 +168,9 @@ def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path
     key = f"{config.split} {points} {config.score} {getattr(outfit, 'scanner', None)} {data}"
     if path.is_file() and beside.is_file() and beside.read_text() == key:
         return read_scores(path)
-    commit = current_commit()
-    floors = score_sampling_floor(outfit, config.split, config.score, points, commit=commit)
-    floors = floors + score_body_floor(outfit, config.split, config.score, points, commit=commit)
+    made = {"points": points, "commit": current_commit(), "ledger": Ledger(path.parent)}
+    floors = score_sampling_floor(outfit, config.split, config.score, **made)
+    floors = floors + score_body_floor(outfit, config.split, config.score, **made)
     write_scores(path, floors)
     write_whole(beside, key.encode())
     return floors

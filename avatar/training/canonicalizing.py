@@ -27,7 +27,8 @@ from avatar.data.outfits import Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.soundness import check_frame_count
 from avatar.data.splits import SplitConfig, split_outfit
-from avatar.io.canonical_scans import read_canonical_scan, read_stamp, write_canonical_scan
+from avatar.io.canonical_scans import write_canonical_scan
+from avatar.io.ledger import Ledger, digest_of
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
 from avatar.records import CanonicalScan, Frame, Mesh, PointCloud, Template
@@ -203,24 +204,29 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
     """Writes every frame's canonical scan to ``<run>/scans/<split>/<frame>.npz``; gives the files in order.
 
     Training frames get a ``<frame>.ply`` beside it, for other programs. What an earlier call with the same weights
-    and settings has finished is checked and left as it is.
+    and settings has finished is checked by hash and left as it is.
     """
     frames = frames or config.frames()
     template = frames.outfits[0].template
     source, stamp = skinning_source(config, template), stamp_of(config)
+    done = Ledger(config.folder / "scans")
     written = []
     for index, where in enumerate(tqdm(frames.names, desc="canonicalize", unit="scan", disable=None)):
         path = config.folder / "scans" / where.split / f"{where.name}.npz"
         written.append(path)
-        picture = path.with_suffix(".ply") if where.split == "train" else path
-        if picture.is_file() and is_finished(path, stamp):
+        made_of = frames.outfits[where.outfit].digest(where.split, where.name)
+        name, key = f"{where.split}/{where.name}", digest_of({"stamp": stamp, "frame": made_of})
+        if done.find(name, key):
             continue
         frame = frames.frame(index)
         weights = source.weights_of(frame.scan.points, frame)
         scan = canonicalize_scan(frame.scan, frame.body, weights, template, config.stretch)
+        files = [path]
         if where.split == "train":
-            write_surface(picture, scan)
+            files.append(path.with_suffix(".ply"))
+            write_surface(files[-1], scan)
         write_canonical_scan(path, scan, stamp)
+        done.record(name, key, files)
     return written
 
 
@@ -238,15 +244,6 @@ def stamp_of(config: CanonicalizeConfig) -> str:
     if config.weights is Skinning.learned:
         parts["learned"] = hashlib.sha256((config.folder / f"{WEIGHTS}.safetensors").read_bytes()).hexdigest()
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-
-
-def is_finished(path: Path, stamp: str) -> bool:
-    """Whether a canonical scan is there, sound and made by what the stamp stands for."""
-    try:
-        read_canonical_scan(path)
-        return read_stamp(path) == stamp
-    except DataError:
-        return False
 
 
 def write_surface(path: Path, scan: CanonicalScan) -> None:

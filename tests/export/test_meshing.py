@@ -220,7 +220,7 @@ def test_a_folder_is_meshed_resumed_and_failures_are_listed(tmp_path):
     assert first.done == ("walk.0001", "walk.0002") and not first.skipped
     assert set(first.failed) == {"walk.0003", "walk.0004"}
     assert "at least 100" in first.failed["walk.0003"] and "walk.0004.ply" in first.failed["walk.0004"]
-    assert {path.name for path in meshes.iterdir()} == {f"walk.000{i}.{e}" for i in (1, 2) for e in ("ply", "glb")}
+    assert {path.name for path in meshes.glob("[!.]*")} == {f"walk.000{i}.{e}" for i in (1, 2) for e in ("ply", "glb")}
 
     (meshes / "walk.0002.glb").write_bytes(b"half")
     second = mesh_folder(clouds, meshes, ("ply", "glb"), frames=["walk.0001", "walk.0002"], config=config)
