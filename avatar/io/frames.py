@@ -16,6 +16,7 @@ from avatar.io.npz import read_arrays, write_arrays, write_whole
 QUANTUM = 5e-5  # metres: 0.05 mm
 FRAME_FORMAT, GARMENT_FORMAT, MANIFEST_FORMAT = "open-frame/1", "open-garment/1", "manifest/1"
 MANIFEST = "manifest.json"
+FARTHEST = 1000.0  # metres; the rounding of float32 is 0.06 mm there
 FRAME_BYTES = 64 << 20  # far above any frame; refuses a file that swells on unpacking
 
 
@@ -110,6 +111,9 @@ def read_open_frame(path: Path) -> OpenFrame:
         limit=FRAME_BYTES,
     )
     _check_format(path, stored, FRAME_FORMAT)
+    for key in ("origin", "translation"):
+        if np.abs(stored[key]).max() > FARTHEST:
+            raise DataError(path, f"{key}: expected metres within {FARTHEST:g} of the origin, got {stored[key]}.")
     folded = (stored["cloth_high"].astype(np.uint16) << 8) | stored["cloth_low"]
     steps = np.where(folded & 1, ~(folded >> 1), folded >> 1)
     quanta = np.cumsum(steps, axis=1, dtype=np.uint16).view(np.int16).T

@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -90,7 +91,7 @@ def _read(
     kind, _, pattern = description.partition(" ")
     try:
         with archive.open(info) as stream:
-            shape, fortran, dtype = READERS[np.lib.format.read_magic(stream)](stream)
+            shape, fortran, dtype = _read_header(path, key, stream)
             start = stream.tell()
             _check_header(path, key, shape, dtype, kind, info.file_size - start)
             array = np.frombuffer(bytearray(stream.read()), dtype=dtype)
@@ -98,7 +99,7 @@ def _read(
     except (KeyError, ValueError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(path, f"{key}: expected a plain array, its header is not one ({error}).") from error
+        raise DataError(path, f"{key}: expected a plain array, it is not one ({error}).") from error
     try:
         dims.update(_match(key, array, pattern, dims))
         if array.dtype.kind == "f":
@@ -106,6 +107,16 @@ def _read(
     except AvatarError as error:
         raise DataError(path, str(error)) from error
     return array
+
+
+def _read_header(path: Path, key: str, stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type of an array, by numpy, which takes its header for Python and may raise what Python does."""
+    try:
+        return READERS[np.lib.format.read_magic(stream)](stream)
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):
+        raise
+    except Exception as error:
+        raise DataError(path, f"{key}: expected a plain array, its header is not one ({error}).") from error
 
 
 def _check_header(path: Path, key: str, shape: tuple, dtype: np.dtype, kind: str, stored: int) -> None:

@@ -16,7 +16,7 @@ from avatar.checks import AvatarError
 from avatar.training.checkpoints import restoring
 
 ROOM = 4  # times the numbers in a weights file: initialisation makes temporaries of a layer's size
-SPARE = 1 << 24  # numbers beside them, 64 MiB: what a network draws, sorts and caches of its template
+SPARE = 1 << 22  # numbers beside them, 16 MiB: what a network draws, sorts and caches of its template
 FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.eye}
 
 

@@ -27,6 +27,7 @@ from avatar.data.outfits import Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.soundness import check_frame_count
 from avatar.data.splits import SplitConfig, split_outfit
+from avatar.geometry.chunks import in_chunks
 from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.ledger import Ledger, digest_of
 from avatar.io.meshes import write_mesh
@@ -39,7 +40,7 @@ from avatar.training.cycles import CycleConfig, CycleTrainer, find_code
 from avatar.training.runs import choose_device, save_settings
 
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
-CHUNK = 20_000  # points asked about at once
+CHUNK = 20_000  # points asked about at once, or fewer where memory runs out
 POSES = "learned_poses"
 
 
@@ -133,7 +134,7 @@ class TrainedCanonicalizer:
         box = bounding_box(to_root_frame(frame.body.vertices, frame.body))[None].to(code.device)
         places = to_root_frame(points, frame.body).to(code.device)
         with torch.no_grad():
-            parts = [self.model.inverse(part[None], code, box)[0] for part in places.split(CHUNK)]
+            parts = in_chunks(lambda chunk: self.model.inverse(places[chunk][None], code, box)[0], len(places), CHUNK)
         return torch.cat(parts).cpu().numpy()
 
 

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from avatar.checks import AvatarError, check_shape
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
+from avatar.geometry.chunks import UNIT, in_chunks
 from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.io.points import write_points
 from avatar.nn.methods import draw_samples
@@ -21,7 +22,7 @@ from avatar.settings import settings_to_dict
 from avatar.training.runs import TrainedAvatar
 
 MAX_POINTS = 400_000
-CHUNK = 100_000  # points decoded at once; the network is pointwise, so chunks change nothing
+CHUNK = 100_000  # points decoded at once, or fewer where memory runs out; the network is pointwise
 
 
 def template_samples(avatar: TrainedAvatar, points: int, seed: int = 0) -> SurfaceSamples:
@@ -63,12 +64,16 @@ def predict(model: torch.nn.Module, batch: Batch, samples: SurfaceSamples, **swi
     """
     check_shape("vertices", batch.vertices, "1 V 3")
     device = next(model.parameters()).device
-    batch, parts = batch.to(device), []
-    for start in range(0, len(samples.face_ids), CHUNK):
-        chunk = slice(start, start + CHUNK)
-        part = SurfaceSamples(samples.vertex_ids[chunk], samples.barycentric[chunk], samples.face_ids[chunk])
-        parts.append(model(batch, part.to(device), **switches))
-    return join_clouds(parts)
+    batch, count = batch.to(device), len(samples.face_ids)
+    rows = torch.arange(-(-count // UNIT) * UNIT).clamp(max=count - 1)  # no leftover: each chunk encodes the body anew
+
+    def decode(chunk: slice) -> Prediction:
+        ids = rows[chunk]
+        part = SurfaceSamples(samples.vertex_ids[ids], samples.barycentric[ids], samples.face_ids[ids])
+        return model(batch, part.to(device), **switches)
+
+    cloud = join_clouds(in_chunks(decode, len(rows), CHUNK))
+    return PointCloud(cloud.points[:count], cloud.normals[:count])
 
 
 def join_clouds(parts: list[Prediction]) -> PointCloud:
