@@ -7,6 +7,7 @@ checked arrays only, and a frame that kills it is one failed frame.
 from __future__ import annotations
 
 import multiprocessing
+import threading
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from avatar.records import Mesh, PointCloud
 
 MIN_POINTS = 100
 EXTENTS = (1e-3, 1e3)  # metres; outside, open3d hangs or the units are wrong
+GRACE_S = 5.0  # beyond timeout_s, for a worker that is stuck before or amid its answer
 START_TIMEOUT_S = 120.0  # importing open3d from a cold disk
 
 
@@ -121,6 +123,8 @@ class PoissonMesher:
         if self._process is None or not self._process.is_alive():
             self._start()
         config, sound = self.config, False
+        watchdog = threading.Timer(config.timeout_s + GRACE_S, self._process.kill)  # a worker that does not even listen
+        watchdog.start()
         try:
             for array in (points, normals, np.array([config.depth], np.int32)):
                 self._connection.send_bytes(array)
@@ -140,6 +144,7 @@ class PoissonMesher:
                 f"{config.depth}, or more than memory_gb={config.memory_gb}."
             ) from error
         finally:
+            watchdog.cancel()
             if not sound:
                 self.close()
         return Mesh(vertices, faces)

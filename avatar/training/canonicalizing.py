@@ -27,6 +27,7 @@ from avatar.data.outfits import Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.soundness import check_frame_count
 from avatar.data.splits import SplitConfig, split_outfit
+from avatar.data.streaming import Streamed
 from avatar.geometry.chunks import in_chunks
 from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.ledger import Ledger, digest_of
@@ -42,6 +43,7 @@ from avatar.training.runs import choose_device, save_settings
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
 CHUNK = 20_000  # points asked about at once, or fewer where memory runs out
 POSES = "learned_poses"
+FRAMES_ROOM = 128 << 20  # bytes of whole frames kept; what is learned from them is kept by itself
 
 
 class Skinning(Enum):
@@ -94,7 +96,7 @@ class CanonicalizeConfig:
         names = name_frames([outfit], "train", [split_outfit(outfit, self.split).train])
         if (outfit.path / "test").is_dir():
             names += name_frames([outfit], "test", [outfit.frames("test")])
-        return FrameDataset([outfit], names, points=1)
+        return FrameDataset([outfit], names, points=1, cache_bytes=FRAMES_ROOM)
 
 
 @dataclass(frozen=True)
@@ -158,10 +160,9 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     names = [frames.names[index].name for index in learned]
     check_frame_count(names, frames.outfits[0].path / "train", "the canonicalizer")
     pool = config.train.draw.pool
-    scans = [
-        prepare_scan(frames.frame(index), template, pool, config.train.seed)
-        for index in tqdm(learned, desc="prepare scans", disable=None)
-    ]
+    scans = Streamed(
+        lambda place: prepare_scan(frames.frame(learned[place]), template, pool, config.train.seed), len(learned)
+    )
     torch.manual_seed(config.train.seed)
     model = Canonicalizer(template, len(scans), config.canonicalizer).to(choose_device(config.device))
     trainer = CycleTrainer(model, template, scans, names, config.train, config.folder)

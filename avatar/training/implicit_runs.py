@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from avatar.body.packed import read_template, write_template
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
@@ -16,6 +16,7 @@ from avatar.checks import AvatarError, DataError
 from avatar.data.mirroring import mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
+from avatar.data.streaming import Streamed
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig
 from avatar.implicit.body_field import BodyField
 from avatar.io.documents import read_yaml
@@ -69,7 +70,8 @@ def train_implicit(config: RunConfig) -> Path:
     forward_field = find_field(canonicalizer_folder(config.runs_root, outfits[0], config.canonical), template)
     split = split_outfit(outfit, config.split)
     seen, held_back = (read_frames(outfit, names, settings.avatar.colored) for names in (split.train, split.validation))
-    box = bounding_box(torch.cat([frame.points for frame in seen] + [template.vertices]), BOX_MARGIN)
+    corners = [torch.stack([frame.points.amin(dim=0), frame.points.amax(dim=0)]) for frame in seen]
+    box = bounding_box(torch.cat([*corners, template.vertices]), BOX_MARGIN)
     torch.manual_seed(config.train.seed)
     model = ImplicitAvatar(template, forward_field, box, settings.avatar).to(choose_device(config.device))
     save_settings(config)
@@ -86,18 +88,21 @@ def train_implicit(config: RunConfig) -> Path:
     return config.folder
 
 
-def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> list[CanonicalFrame]:
-    """The canonical scans of training frames, with the poses they were taken in.
+def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequence[CanonicalFrame]:
+    """The canonical scans of training frames, with the poses they were taken in; read when they are needed.
 
     Raises:
         DataError: for a scan that is not there, or without colours where they are to be learned.
     """
-    frames = [canonical_frame(outfit.load("train", name)) for name in tqdm(names, "canonical scans", disable=None)]
-    plain = [frame.name for frame in frames if frame.colors is None]
-    if colored and plain:
-        path = outfit.frame_path("train", plain[0])
-        raise DataError(path, "this scan has no colours to learn.", "Set method.settings.avatar.colored=false.")
-    return frames
+
+    def read(index: int) -> CanonicalFrame:
+        frame = canonical_frame(outfit.load("train", names[index]))
+        if colored and frame.colors is None:
+            path = outfit.frame_path("train", frame.name)
+            raise DataError(path, "this scan has no colours to learn.", "Set method.settings.avatar.colored=false.")
+        return frame
+
+    return Streamed(read, len(names))
 
 
 def find_field(folder: Path, template: Template) -> nn.Module:

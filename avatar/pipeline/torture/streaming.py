@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from avatar.body.packed import write_body
-from avatar.data.batches import frame_bytes
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.packed_layout import PackedOutfit, write_packed_frame
 from avatar.data.scanner import ScanConfig
+from avatar.data.streaming import bytes_of
 from avatar.io.npz import write_whole
 from avatar.pipeline.methods import train
 from avatar.pipeline.torture.findings import Finding
@@ -49,7 +49,7 @@ def write_large_outfit(root: Path, folder: Path, gigabytes: float) -> dict[str, 
     write_whole(folder / "outfit.yaml", b"format: outfit/1\nlayout: packed\n")
     first = folder / "train" / "walk.00000.npz"
     write_packed_frame(first, frame)
-    each = frame_bytes(PackedOutfit(folder, "packed").load("train", first.stem))
+    each = bytes_of(PackedOutfit(folder, "packed").load("train", first.stem))
     count = int(-(-gigabytes * 1e9 // each))
     for number in range(1, count):
         os.link(first, first.with_name(f"walk.{number:05d}.npz"))

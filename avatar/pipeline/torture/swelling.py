@@ -70,7 +70,7 @@ def deflated(member: str, kind: str, shape: tuple[int, ...], megabytes: int) -> 
 def deflated_checkpoint(folder: Path) -> Callable[[], Any]:
     """A checkpoint of zeros, deflated, under the name that its hash asks for."""
     plain, squeezed = io.BytesIO(), io.BytesIO()
-    torch.save({"model": {"weight": torch.zeros(1 << 26)}, "step": 1, "score": None}, plain)
+    torch.save({"model": {"weight": torch.zeros(1 << 24)}, "step": 1, "score": None}, plain)
     with zipfile.ZipFile(plain) as source, zipfile.ZipFile(squeezed, "w") as target:
         for info in source.infolist():
             target.writestr(info.filename, source.read(info), zipfile.ZIP_DEFLATED, compresslevel=1)
@@ -132,8 +132,8 @@ def corpus() -> dict[str, Bomb]:
         "npz of 24 bytes that promises 3 GiB": file_bomb(
             "template.npz", deflated("vertices", "<f4", (1 << 28, 3), 0), packed_body
         ),
-        "npz of zeros": file_bomb("motion.npz", deflated("trans", "<f4", (1 << 24, 3), 192), read_motion),
-        "npz of zeros, a frame": file_bomb("f.npz", deflated("cloth_high", "|u1", (3, 40 << 20), 120), read_open_frame),
+        "npz of zeros": file_bomb("motion.npz", deflated("trans", "<f4", (1 << 22, 3), 48), read_motion),
+        "npz of zeros, a frame": file_bomb("f.npz", deflated("cloth_high", "|u1", (3, 24 << 20), 72), read_open_frame),
         "npz of many members": file_bomb("model.npz", crowded_npz(), convert_and_drop),
         "pickle memo": file_bomb("model.pkl", memo, convert_and_drop),
         "pickle length": file_bomb("model.pkl", long_bytes, convert_and_drop),

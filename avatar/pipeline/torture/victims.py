@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -75,6 +76,7 @@ def _serve(far: Connection, log: Path | None, function: Callable[..., Any], argu
         os.dup2(sink.fileno(), 2)
     sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
     torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
     try:
         answer = {"value": function(*arguments)}
     except AvatarError as error:
