@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import re
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # of what becomes a file or folder of ours
 INSTALL_LINES = {
     "open3d": "pip install 'avatar[mesh]' and, on Debian or Ubuntu, "
     "apt-get install -y libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0",
@@ -32,6 +34,24 @@ class DataError(AvatarError):
     def __init__(self, path: str | Path, problem: str, mend: str = ""):
         self.path = Path(path)
         super().__init__(f"{path}: {problem}" + (f" {mend}" if mend else ""))
+
+
+def check_name(what: str, name: str) -> str:
+    """A name that may become a file or a folder: it stays where it is put. Gives it back.
+
+    Raises:
+        AvatarError: for any other: with slashes, drives, control characters or blanks, hidden, empty, too long.
+    """
+    if not isinstance(name, str) or not SAFE_NAME.fullmatch(name):
+        raise AvatarError(
+            f"{what}: expected a plain name (letters, digits, '_', '.', '-', at most 64), got {name!r:.200}."
+        )
+    return name
+
+
+def plain_name(text: str, otherwise: str) -> str:
+    """The nearest plain name to what a file calls itself; ``otherwise`` where nothing of it is left."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).lstrip("_.-")[:64] or otherwise
 
 
 def check_shape(name: str, value: Any, pattern: str, **dims: int) -> dict[str, int]:

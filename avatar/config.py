@@ -7,8 +7,10 @@ a config never names code.
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable
@@ -22,7 +24,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, DataError
+from avatar.io.documents import check_events, read_yaml
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.demo import DemoConfig
 from avatar.pipeline.experiments import ExperimentConfig
@@ -32,6 +35,7 @@ from avatar.pipeline.reporting import ReportConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig
 from avatar.pipeline.seams import SeamsConfig
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig
+from avatar.pipeline.torture.trials import TortureConfig
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.simulate.recording import SimulateConfig
 from avatar.training.canonicalizing import CanonicalizeConfig
@@ -55,6 +59,7 @@ VERBS = {
     "seams": SeamsConfig,
     "demo": DemoConfig,
     "simulate": SimulateConfig,
+    "torture": TortureConfig,
 }
 Settings = TypeVar("Settings")
 
@@ -81,6 +86,43 @@ def compose_settings(verb: str, *overrides: str) -> Any:
         return to_settings(VERBS[verb], hydra.compose(verb, list(overrides)))
 
 
+def refuse_code(arguments: list[str]) -> None:
+    """Refuses command lines by which a file could become code; what is typed on them is trusted, files are not.
+
+    Hydra makes objects of what its own options name (callbacks, launchers, log handlers). A folder of configuration
+    from elsewhere (``--config-dir``) may therefore set options of verbs and nothing of Hydra's, nor read the
+    environment, and the two options by which Hydra looks in further places are not taken.
+
+    Raises:
+        AvatarError: naming the option.
+        DataError: naming the file and the word in it.
+    """
+    for argument in arguments:
+        if argument.lstrip("+~").startswith("hydra.searchpath") or argument.startswith("--experimental-rerun"):
+            raise AvatarError(f"{argument.partition('=')[0]}: not taken here; use --config-dir with a folder of YAML.")
+    parser = argparse.ArgumentParser(add_help=False, exit_on_error=False)
+    for names in (("--config-dir", "-cd"), ("--config-path", "-cp")):
+        parser.add_argument(*names, dest="folders", action="append", default=[], type=Path)
+    for folder in parser.parse_known_args(arguments)[0].folders:
+        for path in sorted(folder.rglob("*.y*ml")):
+            refuse_machinery(path, path.relative_to(folder))
+
+
+def refuse_machinery(path: Path, name: Path) -> None:
+    """Refuses a configuration file that speaks of Hydra's own options, of objects, or of the environment.
+
+    Raises:
+        DataError: naming the file and the word in it.
+    """
+    read_yaml(path)
+    text = path.read_text(encoding="utf-8")
+    headers = [line for line in text.splitlines() if "@package" in line]
+    for word in (*check_events(path, text), *headers, str(name)):
+        if any(sign in word for sign in ("hydra", "_target_", "()")) or re.search(r"\$\{[^}]*:", word):
+            mend = "Options of verbs are all that a configuration from elsewhere may set."
+            raise DataError(path, f"{word!r:.100} could run code or read the environment: not read.", mend)
+
+
 def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], Any] | None = None) -> None:
     """Runs a verb from the command line: composes its config, converts it, calls ``run`` with the settings.
 
@@ -102,9 +144,13 @@ def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], An
         logging.basicConfig(level=logging.INFO if team.leads else logging.WARNING, format="%(message)s")
         code = 0
         try:
+            refuse_code(sys.argv[1:])
             main()
         except SystemExit as leaving:
             code = leaving.code
+        except AvatarError as error:
+            print(f"{verb}: {error}", file=sys.stderr)
+            code = 2
     outcomes = read_outcomes(journal)
     if outcomes:
         print(summarise(outcomes), file=sys.stderr)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import types
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -47,7 +48,11 @@ def settings_from_dict(kind: type[Settings], values: dict[str, Any], name: str =
                 + (f"Did you mean {near[0]!r}? " if near else "")
                 + f"There are: {', '.join(hints)}."
             )
-    return kind(**{key: convert_value(hints[key], value, f"{name}{key}") for key, value in values.items()})
+    converted = {key: convert_value(hints[key], value, f"{name}{key}") for key, value in values.items()}
+    try:
+        return kind(**converted)
+    except AvatarError as error:  # ranges are checked by the class, which does not know where its options stand
+        raise AvatarError(f"{name}{error}") from error
 
 
 def convert_value(hint: Any, value: Any, name: str) -> Any:
@@ -61,6 +66,8 @@ def convert_value(hint: Any, value: Any, name: str) -> Any:
         if value is None and type(None) in inner:
             return None
         return convert_value(next(kind for kind in inner if kind is not type(None)), value, name)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise AvatarError(f"{name}: expected a finite number, got {value}.")
     if hint is Any or (isinstance(hint, type) and not is_dataclass(hint) and type(value) is hint):
         return value
     if is_dataclass(hint) and isinstance(value, dict):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 
@@ -14,9 +13,8 @@ from torch.utils.data import Dataset
 from avatar.checks import AvatarError
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import frame_seed
+from avatar.data.streaming import ROOM, Streamed
 from avatar.records import Batch, Frame
-
-CACHE_BYTES = 2 << 30
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class FrameDataset(Dataset):
         names: Sequence[FrameName],
         points: int,
         seed: int = 0,
-        cache_bytes: int = CACHE_BYTES,
+        cache_bytes: int = ROOM,
     ):
         """Prepares frames; none is read yet.
 
@@ -79,8 +77,7 @@ class FrameDataset(Dataset):
                 )
         self.outfits, self.names, self.points, self.seed = tuple(outfits), tuple(names), points, seed
         self.epoch = 0  # the epoch that plain indexing draws scan points for
-        self._cache: OrderedDict[FrameName, Frame] = OrderedDict()
-        self._room = max(cache_bytes, 0)
+        self.frames = Streamed(self._read, len(self.names), cache_bytes)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -107,17 +104,11 @@ class FrameDataset(Dataset):
 
     def frame(self, index: int) -> Frame:
         """A frame, from memory where it is kept."""
+        return self.frames[index]
+
+    def _read(self, index: int) -> Frame:
         where = self.names[index]
-        if where in self._cache:
-            self._cache.move_to_end(where)
-            return self._cache[where]
-        frame = self.outfits[where.outfit].load(where.split, where.name)
-        self._cache[where] = frame
-        self._room -= frame_bytes(frame)
-        while self._room < 0:
-            _, leaving = self._cache.popitem(last=False)
-            self._room += frame_bytes(leaving)
-        return frame
+        return self.outfits[where.outfit].load(where.split, where.name)
 
     def order(self, epoch: int) -> np.ndarray:
         """The permutation in which an epoch goes through the frames, ``(len,)``."""
@@ -166,9 +157,3 @@ def collate(items: Sequence[FrameItem]) -> Batch:
         outfit_ids=torch.tensor([item.outfit for item in items]),
         names=tuple(item.name for item in items),
     )
-
-
-def frame_bytes(frame: Frame) -> int:
-    """Memory that a frame's arrays take."""
-    arrays = [getattr(record, f.name) for record in (frame.body, frame.scan) for f in fields(record)]
-    return sum(array.nbytes for array in arrays if array is not None)

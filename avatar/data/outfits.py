@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from abc import ABC, abstractmethod
 from functools import cached_property
 from pathlib import Path
@@ -11,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, require
+from avatar.checks import SAFE_NAME, AvatarError, DataError, check_name
 from avatar.data.soundness import check_frame, check_template
+from avatar.io.documents import read_yaml
+from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Scan, Template
 
 SPLITS = ("train", "test")
-SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 SAMPLE_FOLDER = Path(__file__).parents[1] / "assets" / "sample"
 OUTFIT_FORMAT = "outfit/1"
 
@@ -75,6 +75,15 @@ class Outfit(ABC):
             raise AvatarError(f"frame: {self.name} has no {split} frame {name!r}; there are {', '.join(near)}, ...")
         return self.path / split / f"{name}.npz"
 
+    def digest(self, split: str, name: str) -> str:
+        """One hash over all of a frame on the disk: its file, and the files that the outfit's frames share."""
+        return digest_of([file_digest(self.frame_path(split, name)), self.shared_digest])
+
+    @cached_property
+    def shared_digest(self) -> str:
+        """One hash over the files that the outfit's frames share."""
+        return files_digest(self.path)
+
     @abstractmethod
     def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
         """The wearer in any pose: ``(J, 3)`` axis-angle, and a translation ``(3,)`` in metres.
@@ -130,13 +139,7 @@ def read_outfit_settings(path: Path) -> dict[str, Any]:
     file = Path(path) / "outfit.yaml"
     if not file.is_file():
         return {}
-    yaml = require("yaml")
-    try:
-        settings = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DataError(file, f"expected plain YAML: {error}.") from error
-    if not isinstance(settings, dict):
-        raise DataError(file, f"expected a mapping, got {type(settings).__name__}.")
+    settings = read_yaml(file)
     if settings.get("format", OUTFIT_FORMAT) != OUTFIT_FORMAT:
         raise DataError(file, f"expected format {OUTFIT_FORMAT}, got {settings['format']}.", "Make the data again.")
     return settings
@@ -151,11 +154,8 @@ def outfit_folder(root: Path, dataset: str, outfit: str) -> Path:
         AvatarError: for names that could leave the data root.
         DataError: for a data set or an outfit that is not there, naming those that are.
     """
-    for what, name in (("dataset", dataset), ("outfit", outfit)):
-        if not SAFE_NAME.fullmatch(name):
-            raise AvatarError(
-                f"{what}: expected a plain name (letters, digits, '_', '.', '-', at most 64), got {name!r}."
-            )
+    check_name("dataset", dataset)
+    check_name("outfit", outfit)
     parent = SAMPLE_FOLDER if dataset == "sample" else Path(root) / dataset
     if (parent / "packed").is_dir():
         parent = parent / "packed"

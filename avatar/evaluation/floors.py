@@ -20,16 +20,24 @@ from avatar.evaluation.scoring import (
     frame_names,
     pick_points,
     posed_body,
+    remember,
     score_frames,
 )
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
+from avatar.io.ledger import Ledger
 from avatar.records import Frame, Mesh, PointCloud
 
 log = logging.getLogger(__name__)
 
 
 def score_sampling_floor(
-    outfit: Outfit, split: str, config: ScoreConfig, points: int, table: str = "", commit: str = ""
+    outfit: Outfit,
+    split: str,
+    config: ScoreConfig,
+    points: int,
+    table: str = "",
+    commit: str = "",
+    ledger: Ledger | None = None,
 ) -> Scores:
     """Scores a second sampling of the true surface as if it were a prediction: what a perfect surface scores.
 
@@ -38,6 +46,7 @@ def score_sampling_floor(
 
     Args:
         points: points of the second sampling; take as many as the methods predict.
+        ledger: where scored frames are taken down, as for predictions.
     """
     names = frame_names(outfit, split)
     resample = getattr(outfit, "resample", None)
@@ -56,11 +65,19 @@ def score_sampling_floor(
     if resample is None:
         log.warning("%s: no true surface to sample again, so the sampling floor compares scan halves.", outfit.name)
     label = Label("sampling", table=table, variant="halves" if resample is None else "", commit=commit)
-    return score_frames(outfit, split, names, replace(config, motion=False), label, compare)
+    config = replace(config, motion=False)
+    memory = remember(ledger, "sampling", outfit, split, config, points=points)
+    return score_frames(outfit, split, names, config, label, compare, memory)
 
 
 def score_body_floor(
-    outfit: Outfit, split: str, config: ScoreConfig, points: int, table: str = "", commit: str = ""
+    outfit: Outfit,
+    split: str,
+    config: ScoreConfig,
+    points: int,
+    table: str = "",
+    commit: str = "",
+    ledger: Ledger | None = None,
 ) -> Scores:
     """Scores points spread area-uniformly over the posed bare body as if they were a prediction: no clothes at all."""
     names = frame_names(outfit, split)
@@ -72,7 +89,9 @@ def score_body_floor(
         return Comparison(sample_body(body, points, config.seed), draw_scan(frame, config), body)
 
     label = Label("body", table=table, commit=commit)
-    return score_frames(outfit, split, names, replace(config, motion=False), label, compare)
+    config = replace(config, motion=False)
+    memory = remember(ledger, "body", outfit, split, config, points=points)
+    return score_frames(outfit, split, names, config, label, compare, memory)
 
 
 def sample_body(body: Mesh, points: int, seed: int) -> PointCloud:

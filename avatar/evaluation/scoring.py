@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from avatar.checks import AvatarError, DataError, require
 from avatar.evaluation.comparison import Comparison
 from avatar.evaluation.metrics import METRICS, Metric, find_metrics
 from avatar.evaluation.scores import FrameScore, Score, Scores
+from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.records import Frame, Mesh, PointCloud, Scan
@@ -74,6 +75,46 @@ class Label:
     fraction: float = 1.0
 
 
+@dataclass(frozen=True)
+class Memory:
+    """Frames that were scored before: a ledger, what is scored in words, and the hash of what a frame's is made of."""
+
+    ledger: Ledger
+    what: str
+    made_of: Callable[[str], str]
+
+    def recall(self, name: str) -> dict[str, Any] | None:
+        """The values and the point count of a frame, where nothing that they were made from has changed."""
+        return self.ledger.find(f"{self.what}/{name}", self.made_of(name))
+
+    def note(self, name: str, values: dict[str, float], points: int) -> None:
+        """Takes down a frame's values."""
+        self.ledger.record(f"{self.what}/{name}", self.made_of(name), note={"values": values, "points": points})
+
+
+def remember(
+    ledger: Ledger | None, what: str, outfit: Any, split: str, config: ScoreConfig, **made: Any
+) -> Memory | None:
+    """The memory of one method's scores on an outfit; none without a ledger or for motion, whose frames hang together.
+
+    Args:
+        ledger: where it is kept.
+        what: the method, in words.
+        outfit: a data set's outfit, with `digest` and maybe a ``scanner``.
+        split, config: what is scored, and how.
+        made: what else the values depend on; functions are asked for each frame by its name.
+    """
+    if ledger is None or config.motion:
+        return None
+    facts = {"config": vars(config), "scanner": vars(outfit.scanner) if hasattr(outfit, "scanner") else None}
+
+    def made_of(name: str) -> str:
+        parts = {key: value(name) if callable(value) else value for key, value in made.items()}
+        return keyed(frame=outfit.digest(split, name), **facts, **parts)
+
+    return Memory(ledger, f"{what} {outfit.name} {split}", made_of)
+
+
 def score_predictions(
     folder: str | Path,
     outfit: Outfit,
@@ -81,6 +122,7 @@ def score_predictions(
     config: ScoreConfig,
     label: Label,
     meshes: str | Path | None = None,
+    ledger: Ledger | None = None,
 ) -> Scores:
     """Scores a folder of predictions, ``<frame>.ply`` with normals for every frame of the split.
 
@@ -92,6 +134,7 @@ def score_predictions(
         label: method, variant and training facts for the rows.
         meshes: a folder of predicted meshes, ``<frame>.ply`` or ``.obj``, which s2m_cm and normal_consistency then
             measure instead of the points; None for point methods.
+        ledger: where scored frames are taken down, so that only new or changed ones are scored; None scores all.
 
     Returns:
         `Scores`: one row a metric, and the single frames.
@@ -111,7 +154,11 @@ def score_predictions(
         mesh = read_mesh(surfaces[frame.name]) if surfaces else None
         return Comparison(prediction, scan, posed_body(outfit, frame), mesh)
 
-    return score_frames(outfit, split, names, config, label, compare)
+    def made_of(name: str) -> list[str]:
+        return [file_digest(files[name]) for files in (clouds, surfaces) if files]
+
+    memory = remember(ledger, "predictions", outfit, split, config, predicted=made_of)
+    return score_frames(outfit, split, names, config, label, compare, memory)
 
 
 def posed_body(outfit: Outfit, frame: Frame) -> Mesh | None:
@@ -185,10 +232,12 @@ def score_frames(
     config: ScoreConfig,
     label: Label,
     compare: Callable[[Frame], Comparison],
+    memory: Memory | None = None,
 ) -> Scores:
     """Every metric of every frame, and their means.
 
     ``compare`` makes the `Comparison` of a frame. Errors it or a metric raises are passed on with the frame's name.
+    Frames that ``memory`` knows are not looked at again.
     """
     metrics = [m for m in find_metrics(config.metrics) if not m.needs_body or getattr(outfit, "template", None)]
     if len(metrics) < len(config.metrics):
@@ -198,17 +247,24 @@ def score_frames(
     for name in require("tqdm").tqdm(
         sorted(names, key=_in_time), desc=f"{label.method} on {outfit.name}", disable=None
     ):
-        try:
-            comparison = compare(outfit.load(split, name))
-            values = {m.name: m.measure(comparison) for m in metrics if not m.sequential}
-            if config.motion:
-                window = [*window, (name, comparison.points)][-3:]
-                values |= _measure_sequence([m for m in metrics if m.sequential], window)
-        except DataError:
-            raise
-        except AvatarError as error:
-            raise AvatarError(f"outfit {outfit.name}, {label.method}, frame {name}: {error}") from error
-        counts.append(len(comparison.points))
+        known = memory.recall(name) if memory else None
+        if known:
+            values, points = known["values"], known["points"]
+        else:
+            try:
+                comparison = compare(outfit.load(split, name))
+                values = {m.name: float(m.measure(comparison)) for m in metrics if not m.sequential}
+                if config.motion:
+                    window = [*window, (name, comparison.points)][-3:]
+                    values |= _measure_sequence([m for m in metrics if m.sequential], window)
+            except DataError:
+                raise
+            except AvatarError as error:
+                raise AvatarError(f"outfit {outfit.name}, {label.method}, frame {name}: {error}") from error
+            points = len(comparison.points)
+            if memory:
+                memory.note(name, values, points)
+        counts.append(points)
         frames += [
             FrameScore(outfit.name, label.method, label.variant, label.seed, name, metric, float(value))
             for metric, value in values.items()

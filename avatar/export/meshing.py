@@ -7,6 +7,7 @@ checked arrays only, and a frame that kills it is one failed frame.
 from __future__ import annotations
 
 import multiprocessing
+import threading
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -17,12 +18,14 @@ import numpy as np
 from avatar.checks import INSTALL_LINES, AvatarError, DataError, check_finite, check_shape, require
 from avatar.export.poisson import FAILED, READY, SOLVED, serve
 from avatar.export.trimming import trim_surface
-from avatar.io.meshes import FORMATS, check_mesh, read_mesh, write_mesh
+from avatar.io.ledger import Ledger, file_digest, keyed
+from avatar.io.meshes import FORMATS, check_mesh, write_mesh
 from avatar.io.points import read_points
 from avatar.records import Mesh, PointCloud
 
 MIN_POINTS = 100
 EXTENTS = (1e-3, 1e3)  # metres; outside, open3d hangs or the units are wrong
+GRACE_S = 5.0  # beyond timeout_s, for a worker that is stuck before or amid its answer
 START_TIMEOUT_S = 120.0  # importing open3d from a cold disk
 
 
@@ -120,6 +123,8 @@ class PoissonMesher:
         if self._process is None or not self._process.is_alive():
             self._start()
         config, sound = self.config, False
+        watchdog = threading.Timer(config.timeout_s + GRACE_S, self._process.kill)  # a worker that does not even listen
+        watchdog.start()
         try:
             for array in (points, normals, np.array([config.depth], np.int32)):
                 self._connection.send_bytes(array)
@@ -139,6 +144,7 @@ class PoissonMesher:
                 f"{config.depth}, or more than memory_gb={config.memory_gb}."
             ) from error
         finally:
+            watchdog.cancel()
             if not sound:
                 self.close()
         return Mesh(vertices, faces)
@@ -218,8 +224,8 @@ def mesh_folder(
 ) -> MeshingReport:
     """Meshes the point clouds ``<name>.ply`` of one folder into ``<name>.<format>`` in another.
 
-    Sound meshes newer than their cloud are kept, so that an interrupted run goes on where it stopped. A frame
-    that fails does not stop the others; it is in the report with its reason.
+    Meshes made of the same cloud with the same settings are kept where their hashes are right, so that an interrupted
+    run goes on where it stopped. A frame that fails does not stop the others; it is in the report with its reason.
 
     Args:
         predictions_dir: folder of oriented point clouds.
@@ -243,12 +249,15 @@ def mesh_folder(
     if not names or missing:
         what = f"no point clouds named {', '.join(missing)}" if missing else "no point clouds (*.ply)"
         raise DataError(predictions_dir, f"{what} in this folder.", "Run tools/predict.py first.")
-    done, skipped, failed = [], [], {}
+    done, skipped, failed, ledger = [], [], {}, Ledger(meshes_dir)
+    settings = config or PoissonConfig()
     with PoissonMesher(config) as mesher:
         for name in require("tqdm").tqdm(names, desc="meshing", unit="frame"):
             source = predictions_dir / f"{name}.ply"
             targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
-            if all(_is_fresh(target, source) for target in targets):
+            made = [getattr(settings, option) for option in ("depth", "max_hole", "min_part")]
+            key = keyed(cloud=file_digest(source), formats=formats, poisson=made)
+            if ledger.find(name, key):
                 skipped.append(name)
                 continue
             try:
@@ -258,16 +267,6 @@ def mesh_folder(
                 continue
             for target in targets:
                 write_mesh(target, mesh)
+            ledger.record(name, key, targets)
             done.append(name)
     return MeshingReport(tuple(done), tuple(skipped), failed, time.monotonic() - started)
-
-
-def _is_fresh(target: Path, source: Path) -> bool:
-    """Whether a mesh is there, newer than its cloud, and sound."""
-    if not target.is_file() or target.stat().st_mtime_ns < source.stat().st_mtime_ns:
-        return False
-    try:
-        read_mesh(target)
-    except DataError:
-        return False
-    return True

@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 
 from avatar.body.skinning import skin_transforms
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.chunks import in_chunks
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import transform_points
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
@@ -126,7 +127,7 @@ class ImplicitAvatar(nn.Module):
         if self.texture is None:
             return mesh
         vertices = torch.from_numpy(mesh.vertices).to(self.box)
-        colors = [self.colors(chunk[None], pose)[0] for chunk in vertices.split(CHUNK)]
+        colors = in_chunks(lambda chunk: self.colors(vertices[chunk][None], pose)[0], len(vertices), CHUNK)
         return replace(mesh, colors=torch.cat(colors).cpu().numpy())
 
     @torch.no_grad()
@@ -138,11 +139,13 @@ class ImplicitAvatar(nn.Module):
             joint_transforms: ``(J, 4, 4)`` posed_from_canonical.
         """
         vertices = torch.from_numpy(mesh.vertices).to(self.box)
-        pose, posed = joint_transforms[None].to(self.box), []
-        for chunk in vertices.split(CHUNK):
-            transforms = skin_transforms(self.field(chunk[None]), pose, self.canonical_from_bind)
-            posed.append(transform_points(transforms, chunk[None])[0])
-        return replace(mesh, vertices=torch.cat(posed).cpu().numpy())
+        pose = joint_transforms[None].to(self.box)
+
+        def carry(chunk: slice) -> Tensor:
+            transforms = skin_transforms(self.field(vertices[chunk][None]), pose, self.canonical_from_bind)
+            return transform_points(transforms, vertices[chunk][None])[0]
+
+        return replace(mesh, vertices=torch.cat(in_chunks(carry, len(vertices), CHUNK)).cpu().numpy())
 
     def posed_mesh(self, joint_transforms: Tensor, config: ExtractionConfig | None = None) -> Mesh:
         """The dressed person in a pose, ``(J, 4, 4)`` posed_from_canonical: extracted, then posed."""

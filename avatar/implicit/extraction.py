@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from avatar.checks import AvatarError, check_finite, check_shape, require
+from avatar.geometry.chunks import in_chunks
 from avatar.records import Mesh
 
-CHUNK = 65_536  # points the field is asked at once
+CHUNK = 65_536  # points the field is asked at once, or fewer where memory runs out
 CORNERS = tuple(product((0, 1), repeat=3))
 # Largest mean distance from a point of a unit cube to its corners, at a corner: (0 + 3 + 3 sqrt 2 + sqrt 3) / 8. With
 # Lipschitz constant L a cell of side s holds no zero where the mean |f| of its corners is above this times L s.
@@ -97,13 +98,16 @@ def _evaluate(
 ) -> int:
     """Puts the field's values at the wanted nodes; gives how many they were."""
     ids = np.argwhere(wanted)
-    found = []
-    for chunk in torch.from_numpy(ids).to(low.device).split(CHUNK):
-        found.append(field(low + step * chunk.to(low.dtype)).float().cpu())
-    if found:
-        joined = torch.cat(found)
-        check_finite("field", joined)
-        values[wanted] = joined.numpy()
+    if not len(ids):
+        return 0
+    nodes = torch.from_numpy(ids).to(low.device)
+
+    def ask(chunk: slice) -> Tensor:
+        return field(low + step * nodes[chunk].to(low.dtype)).float().cpu()
+
+    joined = torch.cat(in_chunks(ask, len(ids), CHUNK))
+    check_finite("field", joined)
+    values[wanted] = joined.numpy()
     return len(ids)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
 
+MAX_NODES = 1 << 24
 CHUNK = 65_536  # nodes evaluated at once
 
 
@@ -33,6 +34,8 @@ class FieldLattice(nn.Module):
         if spacing <= 0:
             raise AvatarError(f"spacing: expected above 0 metres, got {spacing}.")
         cells = ((box[1] - box[0]) / spacing).ceil().long().clamp(min=1)
+        if (cells + 1).double().prod() > MAX_NODES:
+            raise AvatarError(f"spacing: expected at most {MAX_NODES} nodes, {spacing} m makes more of this box.")
         steps = [spacing * torch.arange(int(count) + 1, dtype=box.dtype, device=box.device) for count in cells]
         nodes = torch.stack(torch.meshgrid(*steps, indexing="ij"), dim=-1).reshape(-1, 3) + box[0]
         with torch.no_grad():
@@ -43,10 +46,10 @@ class FieldLattice(nn.Module):
         self.register_buffer("values", values, persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Interpolated values ``(B, N, C)`` at points ``(B, N, 3)``."""
+        """Interpolated values ``(B, N, C)`` at points ``(B, N, 3)``; where a point is NaN, so are its values."""
         check_shape("points", points, "B N 3")
         place = ((points - self.origin) / self.spacing).clamp(min=0).minimum(self.cells.to(points.dtype))
-        low = place.detach().floor().long().minimum(self.cells - 1)
+        low = place.detach().nan_to_num().floor().long().minimum(self.cells - 1)
         share = place - low
         sides = (1 - share, share)
         blended = 0

@@ -12,6 +12,7 @@ from avatar.checks import DataError
 
 MAX_BYTES = 256 << 20
 MAX_JOINTS = 1000
+FARTHEST = 1e9  # of any number in a file: millimetres to the moon would do
 CHANNELS = {f"{axis.lower()}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
 
 
@@ -87,6 +88,8 @@ def _read_hierarchy(tokens: list[str]) -> tuple[list[_Joint], int]:
             at = _expect(tokens, at + 2, "{")
         elif token == "OFFSET":
             offset = [float(value) for value in tokens[at + 1 : at + 4]]
+            if len(offset) != 3 or not np.abs(offset).max() <= FARTHEST:
+                raise ValueError(f"the offset {' '.join(tokens[at + 1 : at + 4])} is none")
             if stack[-1] is not None:
                 joints[stack[-1]].offset = offset
             at += 4
@@ -123,8 +126,8 @@ def _read_frames(tokens: list[str], at: int, channels: int) -> tuple[np.ndarray,
     values = np.array(tokens[at + 1 :], dtype=np.float64)
     if frames < 1 or channels < 3 or values.size != frames * channels:
         raise ValueError(f"{frames} frames of {channels} channels were expected, {values.size} numbers are there")
-    if not np.isfinite(values).all() or not 1e-4 <= seconds <= 10:
-        raise ValueError(f"numbers must be finite and the frame time 0.0001 to 10 s, it is {seconds} s")
+    if not np.abs(values).max() <= FARTHEST or not 1e-4 <= seconds <= 10:
+        raise ValueError(f"numbers must be within {FARTHEST:g} and the frame time 0.0001 to 10 s, it is {seconds} s")
     return values.reshape(frames, channels), 1 / seconds
 
 

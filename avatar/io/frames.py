@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.io.documents import read_json
 from avatar.io.npz import read_arrays, write_arrays, write_whole
 
 QUANTUM = 5e-5  # metres: 0.05 mm
 FRAME_FORMAT, GARMENT_FORMAT, MANIFEST_FORMAT = "open-frame/1", "open-garment/1", "manifest/1"
 MANIFEST = "manifest.json"
+FARTHEST = 1000.0  # metres; the rounding of float32 is 0.06 mm there
 FRAME_BYTES = 64 << 20  # far above any frame; refuses a file that swells on unpacking
 
 
@@ -109,6 +111,9 @@ def read_open_frame(path: Path) -> OpenFrame:
         limit=FRAME_BYTES,
     )
     _check_format(path, stored, FRAME_FORMAT)
+    for key in ("origin", "translation"):
+        if np.abs(stored[key]).max() > FARTHEST:
+            raise DataError(path, f"{key}: expected metres within {FARTHEST:g} of the origin, got {stored[key]}.")
     folded = (stored["cloth_high"].astype(np.uint16) << 8) | stored["cloth_low"]
     steps = np.where(folded & 1, ~(folded >> 1), folded >> 1)
     quanta = np.cumsum(steps, axis=1, dtype=np.uint16).view(np.int16).T
@@ -208,9 +213,9 @@ def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
     folder = Path(folder)
     path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        manifest = read_json(path)
         known = {name: (int(entry["size"]), entry["sha256"]) for name, entry in manifest["files"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise DataError(path, f"expected a manifest, reading failed: {error}.") from error
     if manifest.get("format") != MANIFEST_FORMAT:
         raise DataError(path, f"expected format {MANIFEST_FORMAT}, got {manifest.get('format')}.")

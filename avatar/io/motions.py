@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from avatar.body.model import SMPL_JOINTS
-from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_finite, check_shape, plain_name
 from avatar.io.bvh import BvhMotion, read_bvh
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.io.retargeting import map_joints, retarget
@@ -52,7 +52,7 @@ def read_motion(path: Path, fps: float | None = None, up: str | None = None) -> 
         raise DataError(path, "expected at least one frame, got none.")
     if not low <= motion.fps <= high:
         raise DataError(path, f"expected {low:g} to {high:g} frames per second, got {motion.fps:g}.")
-    motion = replace(motion, source=path)
+    motion = replace(motion, source=path, name=plain_name(motion.name, "motion"))  # frames are files of that name
     return motion if fps is None else resample_motion(motion, fps)
 
 

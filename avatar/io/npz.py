@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from avatar.checks import AvatarError, DataError, check_finite, check_shape
 
 SIZE_LIMIT = 4 << 30  # bytes of arrays in one file, unpacked
 MEMBER_LIMIT = 200
+SWELLING = 100  # arrays of measured things deflate ten times at most; zeros, a thousand times
+SMALL = 16 << 20  # bytes unpacked that nobody needs to look at
 DTYPE_KINDS = {"float": "f", "int": "iu", "bool": "b", "text": "U", "number": "fiu"}
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # one time stamp for all members, so that equal arrays give equal bytes
@@ -65,7 +68,9 @@ def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipf
     infos = archive.infolist()
     if len(infos) > MEMBER_LIMIT:
         raise DataError(path, f"expected at most {MEMBER_LIMIT} arrays, found {len(infos)}.")
-    total = sum(info.file_size for info in infos)
+    total, packed = (sum(getattr(info, of) for info in infos) for of in ("file_size", "compress_size"))
+    if total > max(SMALL, SWELLING * packed):
+        raise DataError(path, f"expected arrays, it swells from {packed} bytes to {total} on unpacking: not read.")
     if total > limit:
         raise DataError(path, f"expected at most {limit} bytes of arrays, it declares {total}.")
     members = {info.filename.removesuffix(".npy"): info for info in infos}
@@ -86,7 +91,7 @@ def _read(
     kind, _, pattern = description.partition(" ")
     try:
         with archive.open(info) as stream:
-            shape, fortran, dtype = READERS[np.lib.format.read_magic(stream)](stream)
+            shape, fortran, dtype = _read_header(path, key, stream)
             start = stream.tell()
             _check_header(path, key, shape, dtype, kind, info.file_size - start)
             array = np.frombuffer(bytearray(stream.read()), dtype=dtype)
@@ -94,7 +99,7 @@ def _read(
     except (KeyError, ValueError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(path, f"{key}: expected a plain array, its header is not one ({error}).") from error
+        raise DataError(path, f"{key}: expected a plain array, it is not one ({error}).") from error
     try:
         dims.update(_match(key, array, pattern, dims))
         if array.dtype.kind == "f":
@@ -102,6 +107,16 @@ def _read(
     except AvatarError as error:
         raise DataError(path, str(error)) from error
     return array
+
+
+def _read_header(path: Path, key: str, stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type of an array, by numpy, which takes its header for Python and may raise what Python does."""
+    try:
+        return READERS[np.lib.format.read_magic(stream)](stream)
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):
+        raise
+    except Exception as error:
+        raise DataError(path, f"{key}: expected a plain array, its header is not one ({error}).") from error
 
 
 def _check_header(path: Path, key: str, shape: tuple, dtype: np.dtype, kind: str, stored: int) -> None:
@@ -150,9 +165,21 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Writes a file atomically: a temporary file beside it, flushed, then renamed. Makes its folder."""
+    """Writes a file atomically: a temporary file beside it, flushed, then renamed. Makes its folder.
+
+    Raises:
+        DataError: when the disk refuses, its cause the `OSError`; the file that was there before is there still.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _replace(path, data)
+    except OSError as error:
+        mend = "Make room and give the same command again."
+        raise DataError(path, f"could not be written ({error.strerror}; {len(data):,} bytes).", mend) from error
+
+
+def _replace(path: Path, data: bytes) -> None:
     part = path.with_name(f".{path.name}.tmp-{os.getpid()}")
     try:
         with part.open("wb") as stream:

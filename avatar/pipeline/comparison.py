@@ -8,8 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from avatar.checks import AvatarError, DataError
-from avatar.data.outfits import SAFE_NAME
+from avatar.checks import AvatarError, DataError, check_name
 from avatar.evaluation.aggregate import FLOORS, method_key
 from avatar.evaluation.canonical_scores import canonical_table
 from avatar.evaluation.curves import plot_fractions, plot_progress, plot_times
@@ -47,8 +46,7 @@ class CompareConfig:
     out: Path = Path("docs/results")
 
     def __post_init__(self):
-        if not SAFE_NAME.fullmatch(self.table):
-            raise AvatarError(f"table: expected a plain name, got {self.table!r}.")
+        check_name("table", self.table)
         if self.pictures < 0 or self.resamples < 100 or not 0 < self.confidence < 1:
             raise AvatarError(
                 "pictures: expected at least 0, resamples: at least 100, confidence: in (0, 1); "

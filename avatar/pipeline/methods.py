@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import yaml
-
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar
+from avatar.io.documents import read_yaml
 from avatar.nn.methods import METHODS
 from avatar.training.implicit_runs import METHOD, ScanimateConfig, load_implicit, train_implicit
 from avatar.training.runs import RunConfig, TrainedAvatar, load_run, train_run
@@ -35,7 +34,8 @@ def train(config: RunConfig) -> Path:
 def load_avatar(folder: Path, checkpoint: str = "last", device: str = "auto") -> TrainedAvatar:
     """The trained avatar of a run's folder, whatever its method; see `load_run`."""
     path = folder / "config.yaml"
-    implicit = path.is_file() and yaml.safe_load(path.read_text())["method"]["name"] == METHOD
+    chosen = read_yaml(path).get("method") if path.is_file() else None
+    implicit = isinstance(chosen, dict) and chosen.get("name") == METHOD
     return (load_implicit if implicit else load_run)(folder, checkpoint, device)
 
 

@@ -24,7 +24,7 @@ from avatar.export.pictures import (
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.pipeline.methods import load_avatar
-from avatar.pipeline.scores import predictions_folder, read_all_scores, run_outfits
+from avatar.pipeline.scores import floors_root, predictions_folder, read_all_scores, run_outfits
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.records import Frame, PointCloud
 from avatar.training.prediction import body_batch, garment_template_cloud, outfit_index, predict, template_samples
@@ -78,7 +78,8 @@ def report(config: ReportConfig) -> Path:
 def gather_scores(config: ReportConfig, avatar: TrainedAvatar) -> Scores:
     """The run's scores, those of the runs it is set against, and the floors, as far as they are there."""
     settings = avatar.config
-    floors = [settings.runs_root / "floors" / settings.dataset / name for name in settings.outfit]
+    root = floors_root(config.run, settings)
+    floors = [root / "floors" / settings.dataset / name for name in settings.outfit]
     paths = [folder / "scores.csv" for folder in (*floors, *config.against, config.run)]
     return read_all_scores(path for path in paths if path.is_file())
 

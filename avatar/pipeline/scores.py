@@ -17,6 +17,7 @@ from avatar.evaluation.scores import Scores, read_scores, write_scores
 from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
 from avatar.implicit.extraction import ExtractionConfig
+from avatar.io.ledger import Ledger
 from avatar.io.motions import read_motion
 from avatar.io.npz import write_whole
 from avatar.pipeline.methods import is_implicit, load_avatar
@@ -110,7 +111,8 @@ def evaluate(config: EvaluateConfig) -> Scores:
     if config.predictions is not None:
         outfit = find_outfit(config.data_root or Path("data"), config.dataset, config.outfit)
         folder = config.out or config.predictions
-        scores = score_predictions(config.predictions, outfit, config.split, config.score, Label(config.method))
+        label, done = Label(config.method), Ledger(folder)
+        scores = score_predictions(config.predictions, outfit, config.split, config.score, label, None, done)
         write_scores(folder / "scores.csv", scores)
         if config.floors:
             scores = score_floors(outfit, config, 50_000, folder / "floors.csv") + scores
@@ -139,10 +141,11 @@ def score_runs(config: EvaluateConfig) -> Scores:
         for outfit in run_outfits(avatar, config.data_root):
             folder = predictions_folder(run, config.split, outfit.name)
             meshes = meshes_folder(run, config.split, outfit.name) if is_implicit(avatar) else None
-            mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes)
+            done = Ledger(run / "predictions")
+            mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes, done)
             if config.floors and outfit.path not in seen:
                 seen.add(outfit.path)
-                path = settings.runs_root / "floors" / settings.dataset / outfit.name / "scores.csv"
+                path = floors_root(run, settings) / "floors" / settings.dataset / outfit.name / "scores.csv"
                 scores = scores + score_floors(outfit, config, mine.rows[-1].points, path)
         write_scores(run / "scores.csv", mine)
         scores = scores + mine
@@ -159,6 +162,14 @@ def variant_of(config: RunConfig) -> str:
     return ", ".join(parts)
 
 
+def floors_root(run: Path, settings: RunConfig) -> Path:
+    """Where the floors of a run's outfits go: the root that it lies in, or its own folder if it was moved.
+
+    What a run's file says of its root is the word of whoever made it, and is believed only where it is true.
+    """
+    return settings.runs_root if settings.folder.resolve() == run.resolve() else run
+
+
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
     """The sampling floor and the bare body for one outfit, kept in a file for the next method.
 
@@ -170,9 +181,9 @@ def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path
     key = f"{config.split} {points} {config.score} {getattr(outfit, 'scanner', None)} {data}"
     if path.is_file() and beside.is_file() and beside.read_text() == key:
         return read_scores(path)
-    commit = current_commit()
-    floors = score_sampling_floor(outfit, config.split, config.score, points, commit=commit)
-    floors = floors + score_body_floor(outfit, config.split, config.score, points, commit=commit)
+    made = {"points": points, "commit": current_commit(), "ledger": Ledger(path.parent)}
+    floors = score_sampling_floor(outfit, config.split, config.score, **made)
+    floors = floors + score_body_floor(outfit, config.split, config.score, **made)
     write_scores(path, floors)
     write_whole(beside, key.encode())
     return floors

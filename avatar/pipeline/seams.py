@@ -7,8 +7,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from avatar.checks import AvatarError
-from avatar.data.outfits import SAFE_NAME, Outfit
+from avatar.checks import AvatarError, check_name
+from avatar.data.outfits import Outfit
 from avatar.evaluation.scoring import Label
 from avatar.evaluation.seam_tables import SeamTest, seam_differences, seam_table, to_csv
 from avatar.evaluation.seams import measure_seams, seam_places
@@ -36,8 +36,7 @@ class SeamsConfig:
     out: Path = Path("docs/results")
 
     def __post_init__(self):
-        if not SAFE_NAME.fullmatch(self.table):
-            raise AvatarError(f"table: expected a plain name, got {self.table!r}.")
+        check_name("table", self.table)
         if self.points < 1 or (self.frames is not None and self.frames < 1):
             raise AvatarError(f"points, frames: expected at least 1, got {self.points} and {self.frames}.")
 

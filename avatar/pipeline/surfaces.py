@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from avatar.checks import AvatarError, DataError
+from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.open_layout import OpenOutfit
 from avatar.export.animation import write_animation, write_usd_meshes, write_usd_points
 from avatar.export.meshing import MeshingReport, PoissonConfig, mesh_folder
@@ -28,6 +28,9 @@ class MeshConfig:
     frames: int | None = None  # this many, evenly spaced; all of them if null
     poisson: PoissonConfig = field(default_factory=PoissonConfig)
 
+    def __post_init__(self):
+        check_name("predictions", self.predictions)
+
 
 @dataclass
 class ExportConfig:
@@ -38,6 +41,9 @@ class ExportConfig:
     fps: float = 30.0
     motion: Path | None = None  # the motion's file, for the rigged body's joint tracks
     data_root: Path | None = None  # where the data are now; where they were at training if null
+
+    def __post_init__(self):
+        check_name("predictions", self.predictions)
 
 
 def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -21,11 +21,46 @@ from avatar.body.open import open_body
 from avatar.body.packed import packed_body, write_body
 from avatar.checks import DataError
 from avatar.io.frames import OpenGarment, read_open_frame, read_open_garment, write_manifest, write_open_garment
+from avatar.io.ledger import Ledger, digest_of, file_digest
 from avatar.records import Motion
 from avatar.simulate.dressing import DressedBody, TravelConfig
 from avatar.simulate.gates import FrameReport, GateConfig, frame_names, record_frame, record_motion
 from avatar.simulate.outfits import OutfitConfig
 from avatar.simulate.poses import NamedPose
+
+
+class FrameLedger:
+    """Which frames of an outfit's folder are finished: by hash, and by pose and garment, which they are made from.
+
+    A sound frame that no ledger knows of, as a killed run and older versions leave them, is taken over.
+    """
+
+    def __init__(self, folder: Path, vertices: int):
+        self.folder, self.vertices = folder, vertices
+        self.ledger, self.garment = Ledger(folder), file_digest(folder / "garment.npz")
+
+    def has(self, path: Path, pose: np.ndarray) -> bool:
+        """Whether a frame is there as it was written."""
+        name, key = self._identify(path, pose)
+        if name in self.ledger.entries or not is_sound(path, pose, self.vertices):
+            return self.ledger.find(name, key) is not None
+        self.ledger.record(name, key, [path])
+        return True
+
+    def note(self, path: Path, pose: np.ndarray) -> None:
+        """Takes down a frame that was made, if it passed its gates and was written."""
+        if path.is_file():
+            self.ledger.record(*self._identify(path, pose), [path])
+
+    def note_all(self, frames: Iterable[tuple[Path, np.ndarray]]) -> None:
+        """Takes down all frames of a sequence."""
+        for path, pose in frames:
+            self.note(path, pose)
+
+    def _identify(self, path: Path, pose: np.ndarray) -> tuple[str, str]:
+        """A frame's name and key."""
+        numbers = np.asarray(pose, np.float32).tolist()
+        return path.relative_to(self.folder).as_posix(), digest_of({"pose": numbers, "garment": self.garment})
 
 
 def is_sound(path: Path, pose: np.ndarray, vertex_count: int) -> bool:
@@ -149,14 +184,21 @@ def simulate_outfit(
         dressed = dress(outfit, travel)
         write_outfit(dressed, folder, gates)
         jobs = [(pose, folder / split / f"{pose.name}.npz") for split, named in poses.items() for pose in named]
-        jobs = [(pose, path) for pose, path in jobs if not is_sound(path, pose.pose, len(dressed.labels))]
+        done = FrameLedger(folder, len(dressed.labels))
+        jobs = [(pose, path) for pose, path in jobs if not done.has(path, pose.pose)]
         bar = {"total": len(jobs), "desc": f"{outfit.name} on {outfit.shape}", "unit": "frame", "disable": not progress}
         if workers == 1 or len(jobs) < 2:
-            reports = [record_frame(dressed, *job, gates) for job in tqdm(jobs, **bar)]
+            reports = []
+            for pose, path in tqdm(jobs, **bar):
+                reports.append(record_frame(dressed, pose, path, gates))
+                done.note(path, pose.pose)
         else:
             with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (outfit, travel, gates)) as pool:
-                futures = [pool.submit(_record_in_worker, *job) for job in jobs]
-                reports = [future.result() for future in tqdm(as_completed(futures), **bar)]
+                futures = {pool.submit(_record_in_worker, pose, path): (path, pose.pose) for pose, path in jobs}
+                reports = []
+                for future in tqdm(as_completed(futures), **bar):
+                    reports.append(future.result())
+                    done.note(*futures[future])
     write_manifest(folder)
     return reports
 
@@ -182,19 +224,25 @@ def simulate_motions(
         dressed = dress(outfit, travel)
         write_outfit(dressed, folder, gates)
         jobs = [(motion, folder / split) for split, named in motions.items() for motion in named]
-        jobs = [job for job in jobs if not is_recorded(*job, len(dressed.labels))]
+        done = FrameLedger(folder, len(dressed.labels))
+        jobs = [job for job in jobs if not all(done.has(*frame) for frame in frames_of(*job))]
         bar = {"total": len(jobs), "desc": f"{outfit.name} on {outfit.shape}", "unit": "sequence"}
         if workers == 1 or len(jobs) < 2:
-            reports = [record_motion(dressed, *job, gates) for job in tqdm(jobs, **bar)]
+            reports = []
+            for job in tqdm(jobs, **bar):
+                reports.append(record_motion(dressed, *job, gates))
+                done.note_all(frames_of(*job))
         else:
             with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (outfit, travel, gates)) as pool:
-                futures = [pool.submit(_play_in_worker, *job) for job in jobs]
-                reports = [future.result() for future in tqdm(as_completed(futures), **bar)]
+                futures = {pool.submit(_play_in_worker, *job): job for job in jobs}
+                reports = []
+                for future in tqdm(as_completed(futures), **bar):
+                    reports.append(future.result())
+                    done.note_all(frames_of(*futures[future]))
     write_manifest(folder)
     return [report for part in reports for report in part]
 
 
-def is_recorded(motion: Motion, folder: Path, vertex_count: int) -> bool:
-    """Whether all frames of a sequence are there and sound."""
-    names = frame_names(motion)
-    return all(is_sound(folder / f"{n}.npz", pose, vertex_count) for n, pose in zip(names, motion.poses))
+def frames_of(motion: Motion, folder: Path) -> list[tuple[Path, np.ndarray]]:
+    """Files and poses of a sequence's frames."""
+    return [(folder / f"{name}.npz", pose) for name, pose in zip(frame_names(motion), motion.poses)]

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from avatar.body.packed import read_template
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig
 from avatar.checks import DataError
 from avatar.data.canonical_frames import CanonicalOutfit
 from avatar.data.outfits import Outfit
+from avatar.io.documents import read_yaml
 from avatar.nn.posing import LearnedSkinning
 from avatar.records import Template
 from avatar.settings import settings_from_dict, settings_to_dict
@@ -33,8 +33,8 @@ def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
     settings, anew = folder / "config.yaml", f"Delete {folder}, then run: {command}"
     if not settings.is_file():
         raise DataError(folder, f"expected the canonicalizer of {outfit.name}, there is none.", f"Make it: {command}")
-    made = yaml.safe_load(settings.read_text())
-    whose = (made.get("dataset"), made.get("outfit")) if isinstance(made, dict) else (None, None)
+    made = read_yaml(settings)
+    whose = (made.get("dataset"), made.get("outfit"))
     if whose != (outfit.dataset, outfit.name):
         raise DataError(settings, f"expected the canonicalizer of {outfit.name}, it is one of {whose[1]}.", anew)
     found, body = read_template(folder / "template.npz"), outfit.template

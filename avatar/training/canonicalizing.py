@@ -20,25 +20,30 @@ from avatar.canonical.fields import SkinningField, bounding_box
 from avatar.canonical.posed import prepare_scan, to_root_frame
 from avatar.canonical.rivals import KNN, NearestBody, SkinningSource
 from avatar.canonical.scans import STRETCH, canonicalize_scan
-from avatar.checks import AvatarError, DataError
+from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
-from avatar.data.outfits import SAFE_NAME, Outfit
+from avatar.data.outfits import Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.soundness import check_frame_count
 from avatar.data.splits import SplitConfig, split_outfit
-from avatar.io.canonical_scans import read_canonical_scan, read_stamp, write_canonical_scan
+from avatar.data.streaming import Streamed
+from avatar.geometry.chunks import in_chunks
+from avatar.io.canonical_scans import write_canonical_scan
+from avatar.io.ledger import Ledger, digest_of
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
 from avatar.records import CanonicalScan, Frame, Mesh, PointCloud, Template
 from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.training.building import building
 from avatar.training.checkpoints import read_weights, write_weights
 from avatar.training.cycles import CycleConfig, CycleTrainer, find_code
 from avatar.training.runs import choose_device, save_settings
 
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
-CHUNK = 20_000  # points asked about at once
+CHUNK = 20_000  # points asked about at once, or fewer where memory runs out
 POSES = "learned_poses"
+FRAMES_ROOM = 128 << 20  # bytes of whole frames kept; what is learned from them is kept by itself
 
 
 class Skinning(Enum):
@@ -69,8 +74,8 @@ class CanonicalizeConfig:
     device: str = "auto"  # auto takes CUDA where there is one
 
     def __post_init__(self):
-        if not SAFE_NAME.fullmatch(self.name):
-            raise AvatarError(f"name: expected a plain name (letters, digits, '_', '.', '-'), got {self.name!r}.")
+        for what in ("name", "dataset", "outfit"):
+            check_name(what, getattr(self, what))
         if self.stretch <= 1:
             raise AvatarError(f"stretch: expected above 1, got {self.stretch}.")
         if min(self.pictures, self.scored) < 0:
@@ -91,7 +96,7 @@ class CanonicalizeConfig:
         names = name_frames([outfit], "train", [split_outfit(outfit, self.split).train])
         if (outfit.path / "test").is_dir():
             names += name_frames([outfit], "test", [outfit.frames("test")])
-        return FrameDataset([outfit], names, points=1)
+        return FrameDataset([outfit], names, points=1, cache_bytes=FRAMES_ROOM)
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,7 @@ class TrainedCanonicalizer:
         box = bounding_box(to_root_frame(frame.body.vertices, frame.body))[None].to(code.device)
         places = to_root_frame(points, frame.body).to(code.device)
         with torch.no_grad():
-            parts = [self.model.inverse(part[None], code, box)[0] for part in places.split(CHUNK)]
+            parts = in_chunks(lambda chunk: self.model.inverse(places[chunk][None], code, box)[0], len(places), CHUNK)
         return torch.cat(parts).cpu().numpy()
 
 
@@ -155,10 +160,9 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     names = [frames.names[index].name for index in learned]
     check_frame_count(names, frames.outfits[0].path / "train", "the canonicalizer")
     pool = config.train.draw.pool
-    scans = [
-        prepare_scan(frames.frame(index), template, pool, config.train.seed)
-        for index in tqdm(learned, desc="prepare scans", disable=None)
-    ]
+    scans = Streamed(
+        lambda place: prepare_scan(frames.frame(learned[place]), template, pool, config.train.seed), len(learned)
+    )
     torch.manual_seed(config.train.seed)
     model = Canonicalizer(template, len(scans), config.canonicalizer).to(choose_device(config.device))
     trainer = CycleTrainer(model, template, scans, names, config.train, config.folder)
@@ -172,7 +176,7 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
 def is_trained(config: CanonicalizeConfig) -> bool:
     """Whether a run's canonicalizer is there, sound and trained to its end."""
     try:
-        return read_weights(config.folder / WEIGHTS)[1]["steps"] >= config.train.steps
+        return int(read_weights(config.folder / WEIGHTS, ("steps",))[1]["steps"]) >= config.train.steps
     except DataError:
         return False
 
@@ -186,11 +190,12 @@ def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicaliz
     if not (folder / f"{WEIGHTS}.json").is_file():
         mend = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
         raise DataError(folder, "no trained canonicalizer here.", mend)
-    weights, facts = read_weights(folder / WEIGHTS)
-    config = settings_from_dict(CanonicalizeConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
-    template, poses = read_template(folder / "template.npz"), weights.pop(POSES)
-    model = Canonicalizer(template, len(facts["frames"]), config.canonicalizer)
-    model.load_state_dict(weights)
+    weights, facts = read_weights(folder / WEIGHTS, ("config", "frames", "steps", "seconds"))
+    with building(folder, weights):
+        config = settings_from_dict(CanonicalizeConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
+        template, poses = read_template(folder / "template.npz"), weights.pop(POSES)
+        model = Canonicalizer(template, len(facts["frames"]), config.canonicalizer)
+        model.load_state_dict(weights)
     model = model.to(choose_device(device)).eval().requires_grad_(False)
     return TrainedCanonicalizer(
         model, template, config, tuple(facts["frames"]), poses, facts["steps"], facts["seconds"]
@@ -201,24 +206,29 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
     """Writes every frame's canonical scan to ``<run>/scans/<split>/<frame>.npz``; gives the files in order.
 
     Training frames get a ``<frame>.ply`` beside it, for other programs. What an earlier call with the same weights
-    and settings has finished is checked and left as it is.
+    and settings has finished is checked by hash and left as it is.
     """
     frames = frames or config.frames()
     template = frames.outfits[0].template
     source, stamp = skinning_source(config, template), stamp_of(config)
+    done = Ledger(config.folder / "scans")
     written = []
     for index, where in enumerate(tqdm(frames.names, desc="canonicalize", unit="scan", disable=None)):
         path = config.folder / "scans" / where.split / f"{where.name}.npz"
         written.append(path)
-        picture = path.with_suffix(".ply") if where.split == "train" else path
-        if picture.is_file() and is_finished(path, stamp):
+        made_of = frames.outfits[where.outfit].digest(where.split, where.name)
+        name, key = f"{where.split}/{where.name}", digest_of({"stamp": stamp, "frame": made_of})
+        if done.find(name, key):
             continue
         frame = frames.frame(index)
         weights = source.weights_of(frame.scan.points, frame)
         scan = canonicalize_scan(frame.scan, frame.body, weights, template, config.stretch)
+        files = [path]
         if where.split == "train":
-            write_surface(picture, scan)
+            files.append(path.with_suffix(".ply"))
+            write_surface(files[-1], scan)
         write_canonical_scan(path, scan, stamp)
+        done.record(name, key, files)
     return written
 
 
@@ -236,15 +246,6 @@ def stamp_of(config: CanonicalizeConfig) -> str:
     if config.weights is Skinning.learned:
         parts["learned"] = hashlib.sha256((config.folder / f"{WEIGHTS}.safetensors").read_bytes()).hexdigest()
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-
-
-def is_finished(path: Path, stamp: str) -> bool:
-    """Whether a canonical scan is there, sound and made by what the stamp stands for."""
-    try:
-        read_canonical_scan(path)
-        return read_stamp(path) == stamp
-    except DataError:
-        return False
 
 
 def write_surface(path: Path, scan: CanonicalScan) -> None:

@@ -9,16 +9,21 @@ import math
 import re
 import shutil
 import warnings
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from avatar.checks import AvatarError, DataError
+from avatar.checks import AvatarError, DataError, check_finite
+from avatar.io.documents import read_json
 from avatar.io.npz import write_whole
 
 MANIFEST = "manifest.json"
@@ -42,8 +47,8 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
         AvatarError: when the state holds a number that is not finite; nothing is written then.
         DataError: when the disk refuses, saying how much room was needed and what there is still.
     """
-    for name, value in _tensors(state):
-        if value.is_floating_point() and not torch.isfinite(value).all():
+    for name, value in named_tensors(state):
+        if not _is_finite(value):
             raise AvatarError(f"{name}: expected finite weights at step {step}; this checkpoint was not written.")
     best = best if best is not None and math.isfinite(best) else None
     buffer = io.BytesIO()
@@ -61,8 +66,8 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
     try:
         write_whole(folder / entry["file"], data)
         write_whole(folder / MANIFEST, _seal(entries))
-    except OSError as error:
-        raise _not_written(folder, error, len(data), before) from error
+    except DataError as error:
+        raise _not_written(folder, error.__cause__, len(data), before) from error
     listed = {kept["file"] for kept in (*entries["last"], entries.get("best", entry))}
     for path in (*folder.glob("step-*.pt"), *folder.glob(".*.tmp-*")):
         if path.name not in listed:
@@ -70,21 +75,25 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
     return folder / entry["file"]
 
 
-def _tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
+def named_tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
     """Every tensor in nested dicts and lists, with its name."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, (dict, list, tuple)):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _tensors(item, f"{name}.{key}" if name else str(key))
+            yield from named_tensors(item, f"{name}.{key}" if name else str(key))
 
 
-def _not_written(folder: Path, error: OSError, needed: int, before: dict[str, Any]) -> DataError:
+def _is_finite(value: Tensor) -> bool:
+    return not value.is_floating_point() or bool(torch.isfinite(value).all())
+
+
+def _not_written(folder: Path, error: BaseException | None, needed: int, before: dict[str, Any]) -> DataError:
     free = shutil.disk_usage(folder if folder.is_dir() else ".").free
     kept = f"step {before['last'][-1]['step']}" if before.get("last") else "none"
     return DataError(
         folder,
-        f"could not write a checkpoint ({error.strerror}; {needed:,} bytes needed, {free:,} free). "
+        f"could not write a checkpoint ({getattr(error, 'strerror', error)}; {needed:,} bytes needed, {free:,} free). "
         f"The last one written: {kept}.",
         "Make room and give the same command again.",
     )
@@ -106,13 +115,12 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / MANIFEST
     if path.is_file():
-        text = path.read_bytes()
         try:
-            entries = json.loads(text)
-            if entries.pop("sha256") == _digest(entries):
+            entries = read_json(path)
+            if entries.pop("sha256", None) == _digest(entries) and _is_listing(entries):
                 return entries
-        except (ValueError, KeyError, TypeError, AttributeError):
-            pass  # not JSON, or not ours: as damaged as a wrong hash
+        except DataError:
+            pass  # not JSON: as damaged as a wrong hash
         warnings.warn(f"{path}: damaged; made again from the checkpoints beside it.", stacklevel=2)
     found = []
     for file in sorted(folder.glob("step-*.pt")):
@@ -125,13 +133,51 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return {"last": found, **best} if found else {}
 
 
+def _is_listing(entries: dict[str, Any]) -> bool:
+    """Whether a manifest lists checkpoints of its own folder: a seal can be forged, a name could lead elsewhere."""
+    last = entries.get("last", [])
+    listed = [*last, *([entries["best"]] if "best" in entries else [])] if isinstance(last, list) else [None]
+    for entry in listed:
+        if not isinstance(entry, dict) or not NAME.fullmatch(str(entry.get("file"))):
+            return False
+        if type(entry.get("step")) is not int or not isinstance(entry.get("score"), (int, float, NoneType)):
+            return False
+        if not re.fullmatch("[0-9a-f]{16,64}", str(entry.get("sha256"))):
+            return False
+    return all(entry["score"] is not None for entry in listed[len(last) :])
+
+
 def _read_sound(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
-    """The state of a listed checkpoint; None when its bytes are not those that were written."""
+    """The state of a listed checkpoint; None when its bytes are not those that were written, or no state of ours."""
     path = folder / entry["file"]
     data = path.read_bytes() if path.is_file() else b""
     if not hashlib.sha256(data).hexdigest().startswith(entry["sha256"]):
         return None
-    return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:  # torch packs nothing, so nothing may swell on unpacking
+            if any(info.file_size != info.compress_size for info in archive.infolist()):
+                return None
+        state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception:  # the hash of a hostile file can be right: what it makes torch raise may be anything
+        return None
+    sound = isinstance(state, dict) and "score" in state and all(_is_finite(value) for _, value in named_tensors(state))
+    return state if sound else None
+
+
+@contextmanager
+def restoring(folder: Path) -> Iterator[None]:
+    """Turns whatever goes wrong while a state is taken over into one error: it is another network's, or a forgery.
+
+    Raises:
+        DataError: naming the folder and the reason.
+    """
+    try:
+        yield
+    except AvatarError:
+        raise
+    except (RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError) as error:
+        reason = " ".join(str(error).split())
+        raise DataError(folder, f"its weights or state do not fit this run ({reason:.300}).") from error
 
 
 def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
@@ -165,7 +211,7 @@ def write_weights(path: Path, weights: dict[str, Tensor], description: dict[str,
         AvatarError: when a weight is not finite; nothing is written then.
     """
     for name, value in weights.items():
-        if value.is_floating_point() and not torch.isfinite(value).all():
+        if not _is_finite(value):
             raise AvatarError(f"{name}: expected finite weights; {path}.safetensors was not written.")
     data = save_tensors({name: value.contiguous().cpu() for name, value in weights.items()})
     described = description | {"sha256": hashlib.sha256(data).hexdigest()}
@@ -173,23 +219,29 @@ def write_weights(path: Path, weights: dict[str, Tensor], description: dict[str,
     write_whole(path.with_suffix(".json"), json.dumps(described, indent=1).encode())
 
 
-def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights and description as `write_weights` left them.
+def read_weights(path: Path, facts: Iterable[str] = ()) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights and description as `write_weights` left them; ``facts`` are the keys the description must have.
 
     Raises:
-        DataError: when a file is missing, or the weights do not match the hash in their description.
+        DataError: when a file is missing, a fact is missing, the weights do not match the hash in their description,
+            or are not finite.
     """
     weights, described = path.with_suffix(".safetensors"), path.with_suffix(".json")
     for needed in (weights, described):
         if not needed.is_file():
             raise DataError(needed, "no such file.", "Train the run first (tools/train.py).")
-    try:
-        description = json.loads(described.read_bytes())
-        expected = description["sha256"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(described, f"expected a description with a sha256 ({error!r}).") from error
+    description = read_json(described)
+    missing = [fact for fact in ("sha256", *facts) if fact not in description]
+    if missing:
+        raise DataError(described, f"expected a description with a sha256 and its facts; {missing[0]} is missing.")
     data = weights.read_bytes()
-    if hashlib.sha256(data).hexdigest() != expected:
+    if hashlib.sha256(data).hexdigest() != description["sha256"]:
         mend = "Give the command that made it again."
         raise DataError(weights, "damaged: its sha256 is not the one in its description.", mend)
-    return load_tensors(data), description
+    try:
+        tensors = load_tensors(data)
+        for name, value in tensors.items():
+            check_finite(name, value)
+    except (SafetensorError, AvatarError) as error:
+        raise DataError(weights, f"expected finite weights ({error}).") from error
+    return tensors, description

@@ -18,7 +18,7 @@ from avatar.canonical.losses import TERMS, CanonicalLossConfig, canonicalization
 from avatar.canonical.posed import DrawConfig, PosedScan, ScanBatch, draw_batch
 from avatar.checks import AvatarError
 from avatar.records import LossTerms, Template
-from avatar.training.checkpoints import load_checkpoint, save_checkpoint
+from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
 from avatar.training.signals import StopRequest, stop_requests
@@ -112,7 +112,7 @@ class CycleTrainer:
                     values["lr"] = self.optimiser.param_groups[0]["lr"]
                     log.write("train", self.step, self.epoch(), self.seconds, values)
                     bar.set_postfix(loss=f"{values['loss']:.3f}", cycle=f"{1e3 * values.get('cycle_points', 0):.1f}mm")
-                if self.step % config.save_every == 0 or done or stopping:
+                if (self.step % config.save_every == 0 and not self.bad_steps) or done or stopping:
                     save_checkpoint(self.folder / "checkpoints", self.state(), self.step)
                 if stopping and not done:
                     stop.leave(self.folder)
@@ -183,9 +183,10 @@ class CycleTrainer:
         """Goes back to the newest sound checkpoint, where there is one."""
         state = load_checkpoint(self.folder / "checkpoints")
         if state is not None:
-            self.model.load_state_dict(state["model"])
-            self.optimiser.load_state_dict(state["optimiser"])
-            self.step, self.seconds = state["step"], state["seconds"]
+            with restoring(self.folder / "checkpoints"):
+                self.model.load_state_dict(state["model"])
+                self.optimiser.load_state_dict(state["optimiser"])
+                self.step, self.seconds = int(state["step"]), float(state["seconds"])
 
 
 def rate_factor(progress: float, decay: float) -> float:

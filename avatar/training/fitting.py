@@ -9,7 +9,7 @@ import torch
 from tqdm import tqdm
 
 from avatar.body.packed import write_template
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, check_name
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
 from avatar.nn.methods import draw_samples
@@ -40,6 +40,8 @@ class FitConfig:
     device: str = "auto"
 
     def __post_init__(self):
+        for what in ("name", "dataset", "outfit"):
+            check_name(what, getattr(self, what))
         if self.steps < 1 or self.code_lr <= 0:
             raise AvatarError(f"steps, code_lr: expected positive values, got {self.steps} and {self.code_lr}.")
 

@@ -78,7 +78,7 @@ class CanonicalFrames:
         """
         if not frames or points < 1:
             raise AvatarError(f"frames, points: expected at least 1 each, got {len(frames)} and {points}.")
-        self.frames, self.points, self.seed, self.symmetry = tuple(frames), points, seed, symmetry
+        self.frames, self.points, self.seed, self.symmetry = frames, points, seed, symmetry
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -18,7 +18,7 @@ from avatar.implicit.avatar import ImplicitAvatar
 from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
 from avatar.implicit.probing import ProbeConfig, probe_field, space_points
 from avatar.records import LossTerms
-from avatar.training.checkpoints import load_checkpoint, save_checkpoint
+from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.training.implicit_batches import CanonicalBatch, CanonicalFrames
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
@@ -98,7 +98,8 @@ class ImplicitTrainer:
                     values = self.validate(held_back.ordered())
                     log.write("validation", self.step, epoch, self.seconds, values)
                     score = values["surface"]
-                if self.due(self.config.save_every) or score is not None or stop.number is not None:
+                worth = (self.due(self.config.save_every) or score is not None) and not self.bad_steps
+                if worth or self.progress() >= 1 or stop.number is not None:
                     save_checkpoint(self.folder / "checkpoints", self.state(), self.step, score)
             bar.close()
             log.close()
@@ -165,9 +166,10 @@ class ImplicitTrainer:
         """Goes back to the newest sound checkpoint, where there is one."""
         state = load_checkpoint(self.folder / "checkpoints")
         if state is not None:
-            self.model.load_state_dict(state["model"])
-            self.optimiser.load_state_dict(state["optimiser"])
-            self.step, self.seconds = state["step"], state["seconds"]
+            with restoring(self.folder / "checkpoints"):
+                self.model.load_state_dict(state["model"])
+                self.optimiser.load_state_dict(state["optimiser"])
+                self.step, self.seconds = int(state["step"]), float(state["seconds"])
 
 
 def log_values(terms: LossTerms) -> dict[str, float]:

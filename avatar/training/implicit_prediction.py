@@ -14,10 +14,12 @@ from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
 from avatar.implicit.avatar import sample_mesh
 from avatar.implicit.extraction import ExtractionConfig
+from avatar.io.ledger import Ledger, keyed
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
 from avatar.records import BodyFit, Motion
-from avatar.training.prediction import MAX_POINTS
+from avatar.settings import settings_to_dict
+from avatar.training.prediction import MAX_POINTS, avatar_digest, pose_digest
 from avatar.training.runs import TrainedAvatar
 
 
@@ -68,8 +70,15 @@ def predict_implicit_frames(
     """
     check_outfit(avatar, outfit)
     names = [name for name in outfit.frames(split) if keep(name)]
-    bodies = ((name, outfit.load(split, name).body) for name in tqdm(names, f"predict {outfit.name}", disable=None))
-    return [write_frame(avatar, body, name, clouds, meshes, points, config) for name, body in bodies]
+    written, done, made_by = [], Ledger(clouds), avatar_digest(avatar)
+    for name in tqdm(names, f"predict {outfit.name}", disable=None):
+        written.append(clouds / f"{name}.ply")
+        made = {"points": points, "surface": settings_to_dict(config), "body": outfit.digest(split, name)}
+        key = keyed(avatar=made_by, **made)
+        if not done.find(name, key):
+            write_frame(avatar, outfit.load(split, name).body, name, clouds, meshes, points, config)
+            done.record(name, key, [written[-1], meshes / f"{name}.ply"])
+    return written
 
 
 def predict_implicit_motion(
@@ -84,11 +93,16 @@ def predict_implicit_motion(
     """Writes ``<motion>.<frame>.ply``, points and surfaces, for every frame of a motion; gives those of points."""
     check_outfit(avatar, outfit)
     check_shape("poses", motion.poses, "T J 3", J=len(avatar.template.parents))
-    written = []
+    written, done, made_by = [], Ledger(clouds), avatar_digest(avatar)
     for frame in tqdm(range(len(motion.poses)), desc=f"predict {motion.name}", disable=None):
-        body = outfit.fit_pose(motion.poses[frame], motion.translations[frame])
         name = f"{motion.name}.{frame:05d}"
-        written.append(write_frame(avatar, body, name, clouds, meshes, points, config))
+        written.append(clouds / f"{name}.ply")
+        made = {"points": points, "surface": settings_to_dict(config), "body": pose_digest(outfit, motion, frame)}
+        key = keyed(avatar=made_by, **made)
+        if not done.find(name, key):
+            body = outfit.fit_pose(motion.poses[frame], motion.translations[frame])
+            write_frame(avatar, body, name, clouds, meshes, points, config)
+            done.record(name, key, [written[-1], meshes / f"{name}.ply"])
     return written
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from avatar.body.packed import read_template, write_template
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
@@ -17,16 +16,26 @@ from avatar.checks import AvatarError, DataError
 from avatar.data.mirroring import mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
+from avatar.data.streaming import Streamed
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig
 from avatar.implicit.body_field import BodyField
+from avatar.io.documents import read_yaml
 from avatar.records import Template
 from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.training.building import building
 from avatar.training.canonical_runs import canonical_outfits, canonicalizer_folder
 from avatar.training.canonicalizing import CanonicalizeConfig, Skinning, load_canonicalizer
-from avatar.training.checkpoints import load_checkpoint, read_weights, write_weights
+from avatar.training.checkpoints import read_weights, write_weights
 from avatar.training.implicit_batches import CanonicalFrame, CanonicalFrames, canonical_frame
 from avatar.training.implicit_loop import ImplicitTrainConfig, ImplicitTrainer
-from avatar.training.runs import WEIGHTS, RunConfig, TrainedAvatar, choose_device, save_settings
+from avatar.training.runs import (
+    WEIGHTS,
+    RunConfig,
+    TrainedAvatar,
+    choose_device,
+    choose_weights,
+    save_settings,
+)
 
 METHOD = "scanimate"  # its name in RunConfig.method
 FIELD = "field."  # how the forward field's weights are named in the avatar's
@@ -61,7 +70,8 @@ def train_implicit(config: RunConfig) -> Path:
     forward_field = find_field(canonicalizer_folder(config.runs_root, outfits[0], config.canonical), template)
     split = split_outfit(outfit, config.split)
     seen, held_back = (read_frames(outfit, names, settings.avatar.colored) for names in (split.train, split.validation))
-    box = bounding_box(torch.cat([frame.points for frame in seen] + [template.vertices]), BOX_MARGIN)
+    corners = [torch.stack([frame.points.amin(dim=0), frame.points.amax(dim=0)]) for frame in seen]
+    box = bounding_box(torch.cat([*corners, template.vertices]), BOX_MARGIN)
     torch.manual_seed(config.train.seed)
     model = ImplicitAvatar(template, forward_field, box, settings.avatar).to(choose_device(config.device))
     save_settings(config)
@@ -78,18 +88,21 @@ def train_implicit(config: RunConfig) -> Path:
     return config.folder
 
 
-def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> list[CanonicalFrame]:
-    """The canonical scans of training frames, with the poses they were taken in.
+def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequence[CanonicalFrame]:
+    """The canonical scans of training frames, with the poses they were taken in; read when they are needed.
 
     Raises:
         DataError: for a scan that is not there, or without colours where they are to be learned.
     """
-    frames = [canonical_frame(outfit.load("train", name)) for name in tqdm(names, "canonical scans", disable=None)]
-    plain = [frame.name for frame in frames if frame.colors is None]
-    if colored and plain:
-        path = outfit.frame_path("train", plain[0])
-        raise DataError(path, "this scan has no colours to learn.", "Set method.settings.avatar.colored=false.")
-    return frames
+
+    def read(index: int) -> CanonicalFrame:
+        frame = canonical_frame(outfit.load("train", names[index]))
+        if colored and frame.colors is None:
+            path = outfit.frame_path("train", frame.name)
+            raise DataError(path, "this scan has no colours to learn.", "Set method.settings.avatar.colored=false.")
+        return frame
+
+    return Streamed(read, len(names))
 
 
 def find_field(folder: Path, template: Template) -> nn.Module:
@@ -101,10 +114,7 @@ def find_field(folder: Path, template: Template) -> nn.Module:
     path = folder / "config.yaml"
     if not path.is_file():
         raise DataError(path, "no such file.", "Run tools/canonicalize.py to its end.")
-    if (
-        settings_from_dict(CanonicalizeConfig, yaml.safe_load(path.read_text()), f"{path}: ").weights
-        is Skinning.learned
-    ):
+    if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is Skinning.learned:
         return load_canonicalizer(folder).forward_field
     return BodyField(template)
 
@@ -140,19 +150,15 @@ def load_implicit(folder: Path, checkpoint: str = "last", device: str = "auto") 
     """
     if checkpoint not in ("last", "best"):
         raise AvatarError(f"checkpoint: expected last or best, got {checkpoint!r}.")
-    weights, facts = read_weights(folder / WEIGHTS)
-    config = settings_from_dict(RunConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
-    if config.method.name != METHOD:
-        raise DataError(folder, f"expected a run of {METHOD}, this is one of {config.method.name}.")
-    steps, seconds = facts["steps"], facts["seconds"]
-    if checkpoint == "best":
-        state = load_checkpoint(folder / "checkpoints", "best")
-        if state is None:
-            raise DataError(folder / "checkpoints", "no best checkpoint: the run held no frames back for validation.")
-        weights, steps, seconds = state["model"], state["step"], state["seconds"]
-    template = read_template(folder / "template.npz")
-    settings = settings_from_dict(ScanimateConfig, config.method.settings, "method.settings.")
-    forward_field = build_field(facts["field"], template, weights)
-    model = ImplicitAvatar(template, forward_field, torch.tensor(facts["box"]), settings.avatar)
-    model.load_state_dict(weights)
+    weights, facts = read_weights(folder / WEIGHTS, ("config", "steps", "seconds", "field", "box"))
+    with building(folder, weights):
+        config = settings_from_dict(RunConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
+        if config.method.name != METHOD:
+            raise DataError(folder, f"expected a run of {METHOD}, this is one of {config.method.name}.")
+        weights, steps, seconds = choose_weights(folder, checkpoint, weights, facts)
+        template = read_template(folder / "template.npz")
+        settings = settings_from_dict(ScanimateConfig, config.method.settings, "method.settings.")
+        forward_field = build_field(facts["field"], template, weights)
+        model = ImplicitAvatar(template, forward_field, torch.tensor(facts["box"]), settings.avatar)
+        model.load_state_dict(weights)
     return TrainedAvatar(model.to(choose_device(device)).eval(), template, config, steps, seconds)

@@ -29,8 +29,8 @@ class TrainingLog:
         writer = csv.DictWriter(text, self.columns, restval="", extrasaction="ignore")
         writer.writeheader()
         writer.writerows(kept)
+        write_whole(self.path, text.getvalue().encode())
         try:
-            write_whole(self.path, text.getvalue().encode())
             self.file = self.path.open("a", newline="")
         except OSError as error:
             raise self._not_written(error) from error
@@ -44,7 +44,9 @@ class TrainingLog:
             self.board = require("torch.utils.tensorboard").SummaryWriter(folder / "tensorboard")
 
     def _not_written(self, error: OSError) -> DataError:
-        return DataError(self.path, f"could not be written ({error.strerror}).", "Make room and run it again.")
+        return DataError(
+            self.path, f"could not be written ({error.strerror}).", "Make room and give the same command again."
+        )
 
     def write(self, split: str, step: int, epoch: int, seconds: float, values: dict[str, float]) -> None:
         """Writes one row and flushes it.

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from avatar.checks import AvatarError
 from avatar.nn.methods import draw_samples
 from avatar.records import Batch, LossTerms, SurfaceSamples
-from avatar.training.checkpoints import load_checkpoint, save_checkpoint
+from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.training.distributed import average, current_team, from_lead, gather, gradients_of, share_norms
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
@@ -159,7 +159,11 @@ class Trainer:
                     score = values.get("chamfer")
                     if log and values:
                         log.write("validation", self.step, epoch, self.seconds, values)
-                if self.step % config.save_every == 0 or score is not None or done or stopping:
+                if (
+                    ((self.step % config.save_every == 0 or score is not None) and not self.bad_steps)
+                    or done
+                    or stopping
+                ):
                     self.save(score)
                 if stopping and not done:
                     stop.leave(self.folder)
@@ -280,9 +284,15 @@ class Trainer:
             weights = {name: value.cpu() for name, value in self.model.state_dict().items()}
             self.model.load_state_dict(from_lead(weights, team))
             return
+        with restoring(self.folder / "checkpoints"):
+            self.restore(state)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Takes a checkpoint's state over."""
+        team = self.team
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.seconds = state["step"], state["seconds"]
+        self.step, self.seconds = int(state["step"]), float(state["seconds"])
         before = (state["threads"], len(state["random"]))
         if before != (torch.get_num_threads(), team.size):
             report.info("Going on with other threads or processes than before: equal to rounding, not to the bit.")

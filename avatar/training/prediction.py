@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,13 +13,16 @@ from tqdm import tqdm
 from avatar.checks import AvatarError, check_shape
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
+from avatar.geometry.chunks import UNIT, in_chunks
+from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.io.points import write_points
 from avatar.nn.methods import draw_samples
 from avatar.records import Batch, BodyFit, Motion, PointCloud, Prediction, SurfaceSamples
+from avatar.settings import settings_to_dict
 from avatar.training.runs import TrainedAvatar
 
 MAX_POINTS = 400_000
-CHUNK = 100_000  # points decoded at once; the network is pointwise, so chunks change nothing
+CHUNK = 100_000  # points decoded at once, or fewer where memory runs out; the network is pointwise
 
 
 def template_samples(avatar: TrainedAvatar, points: int, seed: int = 0) -> SurfaceSamples:
@@ -60,12 +64,16 @@ def predict(model: torch.nn.Module, batch: Batch, samples: SurfaceSamples, **swi
     """
     check_shape("vertices", batch.vertices, "1 V 3")
     device = next(model.parameters()).device
-    batch, parts = batch.to(device), []
-    for start in range(0, len(samples.face_ids), CHUNK):
-        chunk = slice(start, start + CHUNK)
-        part = SurfaceSamples(samples.vertex_ids[chunk], samples.barycentric[chunk], samples.face_ids[chunk])
-        parts.append(model(batch, part.to(device), **switches))
-    return join_clouds(parts)
+    batch, count = batch.to(device), len(samples.face_ids)
+    rows = torch.arange(-(-count // UNIT) * UNIT).clamp(max=count - 1)  # no leftover: each chunk encodes the body anew
+
+    def decode(chunk: slice) -> Prediction:
+        ids = rows[chunk]
+        part = SurfaceSamples(samples.vertex_ids[ids], samples.barycentric[ids], samples.face_ids[ids])
+        return model(batch, part.to(device), **switches)
+
+    cloud = join_clouds(in_chunks(decode, len(rows), CHUNK))
+    return PointCloud(cloud.points[:count], cloud.normals[:count])
 
 
 def join_clouds(parts: list[Prediction]) -> PointCloud:
@@ -80,6 +88,8 @@ def predict_frames(
 ) -> list[Path]:
     """Writes ``<folder>/<frame>.ply`` for the frames of a split; gives the files in order.
 
+    Those that an earlier call made of the same avatar and bodies, and whose hashes are still right, are left alone.
+
     Args:
         avatar: a trained avatar.
         outfit: one of the outfits it was trained on.
@@ -90,12 +100,28 @@ def predict_frames(
     """
     index = outfit_index(avatar, outfit.name)
     samples = template_samples(avatar, points)
-    written = []
+    written, done, made_by = [], Ledger(folder), avatar_digest(avatar)
     for name in tqdm([n for n in outfit.frames(split) if keep(n)], desc=f"predict {outfit.name}", disable=None):
-        batch = body_batch([outfit.load(split, name).body], index, (name,))
         written.append(folder / f"{name}.ply")
-        write_points(written[-1], predict(avatar.model, batch, samples))
+        key = keyed(avatar=made_by, points=points, body=outfit.digest(split, name))
+        if not done.find(name, key):
+            batch = body_batch([outfit.load(split, name).body], index, (name,))
+            write_points(written[-1], predict(avatar.model, batch, samples))
+            done.record(name, key, written[-1:])
     return written
+
+
+def avatar_digest(avatar: TrainedAvatar) -> str:
+    """One hash over all that a trained avatar's predictions depend on: weights, template and settings."""
+    total = hashlib.sha256(digest_of(settings_to_dict(avatar.config.method)).encode())
+    for name, value in avatar.model.state_dict().items():
+        total.update(f"{name} {tuple(value.shape)}".encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return total.hexdigest()
+
+
+def pose_digest(outfit: Outfit, motion: Motion, frame: int) -> str:
+    """One hash over all that the body of a motion's frame depends on: pose, place, and the outfit's shared files."""
+    return digest_of([motion.poses[frame].tolist(), motion.translations[frame].tolist(), outfit.shared_digest])
 
 
 def outfit_index(avatar: TrainedAvatar, name: str) -> int:
@@ -114,12 +140,15 @@ def predict_motion(avatar: TrainedAvatar, outfit: OpenOutfit, motion: Motion, fo
     index = outfit_index(avatar, outfit.name)
     samples = template_samples(avatar, points)
     check_shape("poses", motion.poses, "T J 3", J=len(outfit.body.parents))
-    written = []
+    written, done, made_by = [], Ledger(folder), avatar_digest(avatar)
     for frame in tqdm(range(len(motion.poses)), desc=f"predict {motion.name}", disable=None):
         name = f"{motion.name}.{frame:05d}"
-        body = outfit.fit_pose(motion.poses[frame], motion.translations[frame])
         written.append(folder / f"{name}.ply")
-        write_points(written[-1], predict(avatar.model, body_batch([body], index, (name,)), samples))
+        key = keyed(avatar=made_by, points=points, body=pose_digest(outfit, motion, frame))
+        if not done.find(name, key):
+            body = outfit.fit_pose(motion.poses[frame], motion.translations[frame])
+            write_points(written[-1], predict(avatar.model, body_batch([body], index, (name,)), samples))
+            done.record(name, key, written[-1:])
     return written
 
 

@@ -11,21 +11,23 @@ from typing import Any
 
 import torch
 import yaml
-from torch import nn
+from torch import Tensor, nn
 
 from avatar.body.packed import read_template, write_template
-from avatar.checks import AvatarError, DataError
+from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
 from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
-from avatar.data.outfits import SAFE_NAME, Outfit
+from avatar.data.outfits import Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
+from avatar.io.documents import read_yaml
 from avatar.io.npz import write_whole
 from avatar.nn.closet import Skinning
 from avatar.nn.methods import build_avatar, find_method
 from avatar.records import Batch, Template
 from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.training.building import building
 from avatar.training.canonical_runs import (
     CANONICALIZERS,
     canonical_outfits,
@@ -38,6 +40,7 @@ from avatar.training.distributed import current_team
 from avatar.training.locks import lock_folder
 from avatar.training.loop import TrainConfig, Trainer
 
+MAX_FOLDER = 200  # letters of a folder's name; file systems take 255
 WEIGHTS = "avatar"  # avatar.safetensors and avatar.json in the run's folder
 
 
@@ -76,13 +79,16 @@ class RunConfig:
 
     def __post_init__(self):
         names = {"name": self.name, "method.variant": self.method.variant, "canonical": self.canonical}
-        for what, value in names.items():
-            if not SAFE_NAME.fullmatch(value):
-                raise AvatarError(f"{what}: expected a plain name (letters, digits, '_', '.', '-'), got {value!r}.")
+        for what, value in (names | {"dataset": self.dataset}).items():
+            check_name(what, value)
         if self.method.variant == CANONICALIZERS:
             raise AvatarError(f"method.variant: {CANONICALIZERS!r} is where canonicalizers are. Choose another name.")
         if not self.outfit or len(set(self.outfit)) != len(self.outfit):
             raise AvatarError(f"outfit: expected one or more different outfits, got {self.outfit}.")
+        for name in self.outfit:
+            check_name("outfit", name)
+        if len(self.folder.parent.name) > MAX_FOLDER:
+            raise AvatarError(f"outfit: expected outfits whose names together have at most {MAX_FOLDER} letters.")
 
     @property
     def folder(self) -> Path:
@@ -181,7 +187,7 @@ def save_settings(config: RunConfig) -> None:
     path = config.folder / "config.yaml"
     plain = settings_to_dict(config)
     if path.is_file():
-        before = flatten(yaml.safe_load(path.read_text()))
+        before = flatten(read_yaml(path))
         now = flatten(plain)
         free = {"train.steps", "train.minutes", "train.save_every", "train.log_every", "device", "data_root"}
         free |= {"pictures", "scored"}  # of canonicalizers' runs
@@ -231,18 +237,30 @@ def load_run(folder: Path, checkpoint: str = "last", device: str = "auto") -> Tr
     """
     if checkpoint not in ("last", "best"):
         raise AvatarError(f"checkpoint: expected last or best, got {checkpoint!r}.")
-    weights, facts = read_weights(folder / WEIGHTS)
-    config = settings_from_dict(RunConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
-    steps, seconds = facts["steps"], facts["seconds"]
-    if checkpoint == "best":
-        state = load_checkpoint(folder / "checkpoints", "best")
-        if state is None:
-            raise DataError(folder / "checkpoints", "no best checkpoint: the run held no frames back for validation.")
-        weights, steps, seconds = state["model"], state["step"], state["seconds"]
-    template = read_template(folder / "template.npz")
-    settings = settings_from_dict(find_method(config.method.name).settings, config.method.settings)
-    model = build_avatar(config.method.name, template, len(config.outfit), settings)
-    if takes_fields(settings):
-        model.skin_with(rebuild_skinning(facts["fields"], template))
-    model.load_state_dict(weights)
+    weights, facts = read_weights(folder / WEIGHTS, ("config", "steps", "seconds"))
+    with building(folder, weights):
+        config = settings_from_dict(RunConfig, facts["config"], f"{folder / WEIGHTS}.json: ")
+        weights, steps, seconds = choose_weights(folder, checkpoint, weights, facts)
+        template = read_template(folder / "template.npz")
+        settings = settings_from_dict(find_method(config.method.name).settings, config.method.settings)
+        model = build_avatar(config.method.name, template, len(config.outfit), settings)
+        if takes_fields(settings):
+            model.skin_with(rebuild_skinning(facts["fields"], template))
+        model.load_state_dict(weights)
     return TrainedAvatar(model.to(choose_device(device)).eval(), template, config, steps, seconds)
+
+
+def choose_weights(
+    folder: Path, checkpoint: str, last: dict[str, Tensor], facts: dict[str, Any]
+) -> tuple[dict[str, Tensor], int, float]:
+    """Weights, steps and seconds of a run: the ``last``, which are given, or those of its ``best`` checkpoint.
+
+    Raises:
+        DataError: for the best of a run that held no frames back.
+    """
+    if checkpoint == "last":
+        return last, int(facts["steps"]), float(facts["seconds"])
+    state = load_checkpoint(folder / "checkpoints", "best")
+    if state is None:
+        raise DataError(folder / "checkpoints", "no best checkpoint: the run held no frames back for validation.")
+    return state["model"], int(state["step"]), float(state["seconds"])

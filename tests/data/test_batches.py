@@ -6,7 +6,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from avatar.checks import AvatarError
-from avatar.data.batches import FrameDataset, collate, draw_points, frame_bytes, name_frames
+from avatar.data.batches import FrameDataset, collate, draw_points, name_frames
+from avatar.data.streaming import bytes_of
 
 
 @pytest.fixture
@@ -79,7 +80,7 @@ def test_scans_with_fewer_points_repeat_them_evenly():
 
 
 def test_memory_is_bounded_and_changes_nothing(tiny_outfit, frames):
-    one = frame_bytes(tiny_outfit.load("train", "rise.00000"))
+    one = bytes_of(tiny_outfit.load("train", "rise.00000"))
     assert one > 12272 * 22 * 4
     small = FrameDataset([tiny_outfit], frames.names, points=500, seed=7, cache_bytes=int(2.5 * one))
     none = FrameDataset([tiny_outfit], frames.names, points=500, seed=7, cache_bytes=0)
@@ -87,8 +88,11 @@ def test_memory_is_bounded_and_changes_nothing(tiny_outfit, frames):
         a, b, c = (dataset.item(0, index) for dataset in (frames, small, none))
         assert torch.equal(a.scan_points, b.scan_points)
         assert torch.equal(a.vertices, c.vertices)
-    assert [name.name for name in small._cache] == ["rise.00000", "rise.00002"]  # least recently used left
-    assert not none._cache
+    assert [small.names[index].name for index in small.frames.kept] == [
+        "rise.00000",
+        "rise.00002",
+    ]  # least recently used left
+    assert not none.frames.kept
     assert frames.frame(0) is frames.frame(0)
 
 

@@ -190,6 +190,20 @@ def test_a_worker_killed_during_a_job_is_one_failed_cloud():
         assert mesher.worker_pid != victim
 
 
+def test_a_worker_that_does_not_listen_is_ended(monkeypatch):
+    monkeypatch.setattr("avatar.export.meshing.GRACE_S", 0.2)
+    with PoissonMesher(PoissonConfig(depth=5, max_hole=0.1)) as mesher:
+        mesher.mesh(GOOD)
+        mesher.config.timeout_s = 0.3
+        os.kill(mesher.worker_pid, signal.SIGSTOP)
+        started = time.monotonic()
+        with pytest.raises(MeshingError, match="died"):
+            mesher.mesh(GOOD)
+        assert time.monotonic() - started < 10
+        mesher.config.timeout_s = 60.0
+        assert len(mesher.mesh(GOOD).faces)
+
+
 def test_a_job_that_takes_too_long_is_ended():
     with PoissonMesher(PoissonConfig(depth=6)) as mesher:
         mesher.mesh(sphere_points())
@@ -220,7 +234,7 @@ def test_a_folder_is_meshed_resumed_and_failures_are_listed(tmp_path):
     assert first.done == ("walk.0001", "walk.0002") and not first.skipped
     assert set(first.failed) == {"walk.0003", "walk.0004"}
     assert "at least 100" in first.failed["walk.0003"] and "walk.0004.ply" in first.failed["walk.0004"]
-    assert {path.name for path in meshes.iterdir()} == {f"walk.000{i}.{e}" for i in (1, 2) for e in ("ply", "glb")}
+    assert {path.name for path in meshes.glob("[!.]*")} == {f"walk.000{i}.{e}" for i in (1, 2) for e in ("ply", "glb")}
 
     (meshes / "walk.0002.glb").write_bytes(b"half")
     second = mesh_folder(clouds, meshes, ("ply", "glb"), frames=["walk.0001", "walk.0002"], config=config)

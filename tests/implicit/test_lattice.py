@@ -44,9 +44,17 @@ def test_outside_the_border_goes_on():
     assert found[0] == pytest.approx(0.5, abs=1e-5) and found[2] == pytest.approx(-0.2, abs=1e-5)
 
 
+def test_a_point_that_is_nan_gives_nan_and_leaves_the_others_alone():
+    lattice = FieldLattice(lambda p: p, BOX, 0.1)
+    points = torch.tensor([[[float("nan"), 0.1, 0.1], [0.1, 0.1, 0.1]]])
+    found = lattice(points)[0]
+    assert found[0].isnan().any() and torch.equal(found[1], lattice(points[:, 1:])[0, 0])
+
+
 def test_a_spacing_of_nothing_is_refused():
-    with pytest.raises(AvatarError, match="spacing"):
-        FieldLattice(lambda p: p, BOX, 0.0)
+    for spacing in (0.0, 1e-4):
+        with pytest.raises(AvatarError, match="spacing"):
+            FieldLattice(lambda p: p, BOX, spacing)
 
 
 def test_the_body_field_is_the_body_on_its_skin_and_a_blend_around_it():

@@ -12,8 +12,8 @@ import torch
 from spheres import TEMPLATE, random_batch, small_config
 
 from avatar.checks import AvatarError, DataError
+from avatar.io import npz
 from avatar.nn.closet import ClosetAvatar
-from avatar.training import checkpoints
 from avatar.training.checkpoints import load_checkpoint
 from avatar.training.locks import HELD, lock_folder
 from avatar.training.logs import read_log
@@ -101,9 +101,8 @@ def test_a_full_disk_ends_training_with_the_last_checkpoint_sound(tmp_path, monk
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return write(path, data)
 
-    write, refused = checkpoints.write_whole, []
-    monkeypatch.setattr(checkpoints, "write_whole", full)
-    monkeypatch.setattr("avatar.training.logs.write_whole", full)
+    write, refused = npz._replace, []
+    monkeypatch.setattr(npz, "_replace", full)
     for kind in (".pt", ".json", ".csv"):
         refused.append(kind)
         with pytest.raises(DataError, match="No space left"):
