@@ -101,7 +101,7 @@ class Trainer:
         codes = [parameter for name, parameter in model.named_parameters() if name == "codes"]
         others = [parameter for name, parameter in model.named_parameters() if name != "codes"]
         groups = [{"params": others, "lr": config.lr}, {"params": codes, "lr": config.code_lr}]
-        self.optimiser = torch.optim.Adam(groups)
+        self.optimiser = torch.optim.Adam(groups, fused=True)
         self.base_rates = [config.lr, config.code_lr]
         self.step, self.seconds, self.bad_steps = 0, 0.0, 0
 
