@@ -24,6 +24,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+import avatar.environment  # noqa: F401  first of all: it says how threads wait, which torch reads when it is imported
 from avatar.checks import AvatarError, DataError
 from avatar.io.documents import check_events, read_yaml
 from avatar.pipeline.comparison import CompareConfig
