@@ -11,16 +11,19 @@ from pathlib import Path
 
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.io.npz import write_whole
+from avatar.pipeline.canonicalization import canonicalize
 from avatar.pipeline.reporting import ReportConfig, report
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import MeshConfig, mesh
+from avatar.training.canonicalizing import CanonicalizeConfig
 from avatar.training.runs import MethodChoice, RunConfig, train_run
 
 
 @dataclass
 class DemoConfig(RunConfig):
-    """The main job: train an avatar and its static floor, predict, score, mesh and report."""
+    """The main job: canonicalize, train an avatar and its static floor, predict, score, mesh and report."""
 
+    canonicalizer: CanonicalizeConfig = field(default_factory=CanonicalizeConfig)  # its data and name are the run's
     static_share: float = 0.4  # of the training minutes, spent on the static floor
     points: int = 50000
     meshes: int = 4  # frames meshed
@@ -41,6 +44,12 @@ def demo(config: DemoConfig) -> Path:
     settings = RunConfig(**{f.name: getattr(config, f.name) for f in fields(RunConfig)})
     budget = replace(settings.train, minutes=(settings.train.minutes or 2.0) * config.static_share)
     static = MethodChoice("closet", "static", settings.method.settings | {"pose": False})
+    where = {key: getattr(settings, key) for key in ("dataset", "data_root", "runs_root", "device")}
+    with stage("canonicalize"):
+        carried = [
+            canonicalize(replace(config.canonicalizer, outfit=outfit, name=settings.canonical, **where))
+            for outfit in settings.outfit
+        ]
     with stage("train"):
         run = train_run(settings)
     with stage("train static floor"):
@@ -61,6 +70,7 @@ def demo(config: DemoConfig) -> Path:
         ],
         "made": {
             "report": str(page),
+            "canonical scans": [str(folder / "scans") for folder in carried],
             "points": [str(path) for path in folders],
             "meshes": [str(path) for path in meshes],
             "weights": str(run / "avatar.safetensors"),
@@ -69,7 +79,7 @@ def demo(config: DemoConfig) -> Path:
     path = config.runs_root / "demo" / "summary.json"
     write_whole(path, json.dumps(summary, indent=1).encode())
     print(f"\ndemo: done in {summary['seconds']['total']:.0f} s")
-    for what, where in summary["made"].items():
-        print(f"  {what:8} {where if isinstance(where, str) else ', '.join(where)}")
-    print(f"  summary  {path}")
+    for what, paths in summary["made"].items():
+        print(f"  {what:15} {paths if isinstance(paths, str) else ', '.join(paths)}")
+    print(f"  summary         {path}")
     return path
