@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -103,6 +104,7 @@ def torture(config: TortureConfig) -> Path:
             log.info("%s: done before.", name)
             continue
         log.info("%s: %s", name, ", ".join(f"{key}={value}" for key, value in counts.items()))
+        shutil.rmtree(root / name, ignore_errors=True)
         started, commit = time.monotonic(), current_commit()
         findings = trial(config, root / name)
         seconds = time.monotonic() - started
