@@ -51,7 +51,7 @@ class TortureConfig:
     meshes: int = 1000  # frames meshed
     demo_minutes: float = 0.2  # training time of the demo without a network
     stream_gb: float = 10.0  # size of the outfit that is streamed
-    stream_frames: int = 400  # frames of it that training reads
+    stream_frames: int = 240  # frames of it that training reads
     seed: int = 0
     again: bool = False  # do finished trials of the same size again
     root: Path = Path("runs/torture")  # where to work; emptied trial by trial
