@@ -1,6 +1,7 @@
 """Every trial of `torture` in a short version, and proofs that the trials can fail."""
 
 import pickle
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -119,6 +120,8 @@ def train_and_die(job: str, root: Path, name: str, step: int) -> None:
 
 def test_work_without_a_network(root):
     alone = ["unshare", "--net", "--map-root-user"]
+    if shutil.which("unshare") is None or subprocess.run([*alone, "true"], capture_output=True).returncode:
+        pytest.skip("this system lets nobody make a network namespace")
     code = "from pathlib import Path; from avatar.pipeline.torture.miniature import prepare, train_job; "
     code += f"root = Path({str(root / 'alone')!r}); prepare(root); print(train_job('closet', root))"
     done = subprocess.run([*alone, sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
