@@ -24,14 +24,17 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+import avatar.environment  # noqa: F401  first of all: it says how threads wait, which torch reads when it is imported
 from avatar.checks import AvatarError, DataError
 from avatar.io.documents import check_events, read_yaml
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.demo import DemoConfig
+from avatar.pipeline.experiments import ExperimentConfig
 from avatar.pipeline.methods import SETTINGS
 from avatar.pipeline.outcomes import State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
 from avatar.pipeline.reporting import ReportConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig
+from avatar.pipeline.seams import SeamsConfig
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig
 from avatar.pipeline.torture.trials import TortureConfig
 from avatar.settings import settings_from_dict, settings_to_dict
@@ -50,9 +53,11 @@ VERBS = {
     "predict": PredictConfig,
     "evaluate": EvaluateConfig,
     "compare": CompareConfig,
+    "experiment": ExperimentConfig,
     "mesh": MeshConfig,
     "export": ExportConfig,
     "report": ReportConfig,
+    "seams": SeamsConfig,
     "demo": DemoConfig,
     "simulate": SimulateConfig,
     "torture": TortureConfig,
@@ -73,6 +78,13 @@ def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
     """A composed config as its settings class."""
     plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     return settings_from_dict(kind, plain)
+
+
+def compose_settings(verb: str, *overrides: str) -> Any:
+    """A verb's settings as the command line would give them with these overrides."""
+    register()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return to_settings(VERBS[verb], hydra.compose(verb, list(overrides)))
 
 
 def refuse_code(arguments: list[str]) -> None:
@@ -112,12 +124,13 @@ def refuse_machinery(path: Path, name: Path) -> None:
             raise DataError(path, f"{word!r:.100} could run code or read the environment: not read.", mend)
 
 
-def command(verb: str, run: Callable[[Any], Any]) -> None:
+def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], Any] | None = None) -> None:
     """Runs a verb from the command line: composes its config, converts it, calls ``run`` with the settings.
 
     Bad input ends in one line on standard error and exit code 2, not in a traceback; a signal that asks to stop in
     exit code 75 once all is saved. In a multirun, by whatever launcher, the other jobs go on after a failure; those
-    that did not finish are named with the reason at the end, and the exit code is 2.
+    that did not finish are named with the reason at the end, and the exit code is 2. After that ``then`` is called
+    with the settings of the jobs that did finish, if any, unless the multirun was asked to stop.
     """
     register()
     journal = Path("runs/multirun").absolute() / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{os.getpid()}"
@@ -126,7 +139,7 @@ def command(verb: str, run: Callable[[Any], Any]) -> None:
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=verb)
     def main(config: DictConfig) -> None:
-        run_job(verb, run, config, journal, parent)
+        run_job(verb, run, config, journal, parent, then)
 
     with torchrun_team() as team, leave_when_asked(lambda number: ask_to_stop(journal, number)):
         logging.basicConfig(level=logging.INFO if team.leads else logging.WARNING, format="%(message)s")
@@ -143,13 +156,28 @@ def command(verb: str, run: Callable[[Any], Any]) -> None:
     if outcomes:
         print(summarise(outcomes), file=sys.stderr)
     states = {State(outcome.state) for outcome in outcomes} - {State.finished}
+    finished = [outcome.settings for outcome in outcomes if outcome.state == State.finished.value]
+    if then is not None and finished and State.stopped not in states:
+        try:
+            then([settings_from_dict(VERBS[verb], settings) for settings in finished])
+        except AvatarError as error:
+            print(f"{verb}: {error}", file=sys.stderr)
+            code = code or 2
     sys.exit(STOPPED if State.stopped in states else code or (2 if states else 0))
 
 
-def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: Path, parent: int) -> None:
+def run_job(
+    verb: str,
+    run: Callable[[Any], Any],
+    config: DictConfig,
+    journal: Path,
+    parent: int,
+    then: Callable[[list[Any]], Any] | None = None,
+) -> None:
     """One job of a verb, in the ``parent`` process or in one that a launcher started.
 
-    In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave.
+    In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. ``then`` follows a job
+    that is the only one.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")  # what verbs report; conf/hydra keeps Hydra quiet
     job = HydraConfig.get()
@@ -170,8 +198,11 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
     if several:
         note_outcome(journal, job.job.num, name, State.running)
     try:
+        settings = to_settings(VERBS[verb], config)
         with leave_when_asked():
-            run(to_settings(VERBS[verb], config))
+            run(settings)
+            if then is not None and not several and current_team().leads:
+                then([settings])
     except Stopped as stopped:
         return end(State.stopped, str(stopped), STOPPED)
     except SystemExit as leaving:
@@ -186,5 +217,5 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
         traceback.print_exc()
         return end(State.failed, f"{type(error).__name__}: {error}", 1)
     if several:
-        note_outcome(journal, job.job.num, name, State.finished)
+        note_outcome(journal, job.job.num, name, State.finished, settings=settings_to_dict(settings))
     return None

@@ -168,9 +168,9 @@ class Prediction:
     """What a point avatar predicts.
 
     ``points (B, N, 3)`` posed, metres; ``normals (B, N, 3)`` unit; ``offsets (B, N, 3)`` r before the local
-    transform; ``garment_offsets`` and ``wrinkle_offsets`` its two parts (CloSET eq. 3; the first is None for a
-    method without explicit template); ``wrinkle_normals (B, N, 3)`` what the pose adds to the garment's normals before
-    they are normalised, or None; ``codes`` the garment codes used ``(B, ..., C)`` or None.
+    transform; ``garment_offsets`` and ``wrinkle_offsets`` its two parts (CloSET eq. 3; None for a method without
+    explicit template, whose r has no parts to be weighted apart); ``wrinkle_normals (B, N, 3)`` what the pose adds to
+    the garment's normals before they are normalised, or None; ``codes`` the garment codes used ``(B, ..., C)`` or None.
     """
 
     points: Tensor

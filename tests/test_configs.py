@@ -2,14 +2,16 @@
 
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+import yaml
 from hydra.errors import HydraException
 
 from avatar.checks import AvatarError, DataError
-from avatar.config import CONF, VERBS, refuse_code, register, to_settings
+from avatar.config import CONF, VERBS, refuse_code
+from avatar.config import compose_settings as load
 from avatar.pipeline.methods import find_settings
 from avatar.settings import settings_from_dict
 
@@ -17,12 +19,6 @@ ROOT = Path(__file__).parents[1]
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SIZES = sorted(path.stem for path in (CONF / "size").glob("*.yaml"))
-
-
-def load(verb: str, *overrides: str):
-    register()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return to_settings(VERBS[verb], compose(verb, list(overrides)))
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -47,9 +43,30 @@ def test_every_method_and_size_gives_its_settings(method, size):
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes_and_says_how_to_run_it(experiment):
-    load("train", f"experiment={experiment}")
-    first = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()[0]
-    assert first.startswith("# python tools/train.py") and f"experiment={experiment}" in first
+    config = load("experiment", f"experiment={experiment}")
+    assert config.compare.table == experiment and config.run.name.startswith(experiment)
+    assert set(config.score.metrics) == set(config.compare.metrics)
+    lines = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()
+    assert lines[:2] == ["# @package _global_", f"# python tools/experiment.py experiment={experiment}"]
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_no_two_jobs_of_an_experiment_share_a_folder(experiment):
+    """Two values of each option that its file sweeps, in all combinations."""
+    plain = yaml.safe_load((CONF / "experiment" / f"{experiment}.yaml").read_text())
+    swept = {key: str(values).split(",")[:2] for key, values in plain["hydra"]["sweeper"]["params"].items()}
+    folders = []
+    for values in product(*swept.values()):
+        choices = [f"{key}={value}" for key, value in zip(swept, values)]
+        folders.append(load("experiment", f"experiment={experiment}", *choices).run.folder)
+    assert len(set(folders)) == len(folders) > 1
+
+
+def test_equal_time_instead_of_equal_steps_is_one_switch():
+    steps = load("experiment", "experiment=closet5", "train.steps=70").run
+    assert (steps.train.steps, steps.train.minutes, steps.name) == (70, None, "closet5_70steps_1_seed0")
+    clock = load("experiment", "experiment=closet5", "budget=minutes", "train.minutes=0.5").run
+    assert (clock.train.steps, clock.train.minutes, clock.name) == (1_000_000, 0.5, "closet5_0.5min_1_seed0")
 
 
 def test_several_outfits_and_nested_options():

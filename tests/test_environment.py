@@ -1,5 +1,6 @@
 """The doctor: what is there, what is missing, and the line that mends it."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -33,6 +34,38 @@ def test_a_missing_package_comes_with_its_install_line():
 )
 def test_a_missing_library_is_mended_by_its_package(message, line):
     assert mending_line("open3d", message).startswith(line)
+
+
+def in_fresh_python(code: str, **variables: str) -> subprocess.CompletedProcess:
+    """A new interpreter's output, without what this one says about threads."""
+    kept = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, env=kept | variables
+    )
+
+
+def test_every_verb_has_its_idle_threads_sleep_unless_told_otherwise():
+    """OpenMP itself says what it has read; it does so when torch loads it."""
+    said = in_fresh_python("import avatar.config", OMP_DISPLAY_ENV="true").stderr
+    assert "OMP_WAIT_POLICY = 'PASSIVE'" in said
+    said = in_fresh_python("import avatar.config", OMP_DISPLAY_ENV="true", OMP_WAIT_POLICY="ACTIVE").stderr
+    assert "OMP_WAIT_POLICY = 'ACTIVE'" in said
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc's allocator")
+def test_freed_memory_is_kept_for_what_comes_next():
+    """A large array costs page faults every time, or only the first time."""
+    code = (
+        "import resource, torch, avatar.environment as e\n"
+        "def faults():\n"
+        "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "    for _ in range(3): torch.ones(1 << 24)\n"
+        "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before\n"
+        "thrown_away = min(faults() for _ in range(8)); assert e.keep_freed_memory()\n"
+        "print(thrown_away, min(faults() for _ in range(8)))"
+    )
+    thrown_away, kept = map(int, in_fresh_python(code).stdout.split())
+    assert thrown_away > 3 * 10_000 and kept < 1000
 
 
 @pytest.mark.slow

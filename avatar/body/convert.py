@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from avatar.body.inert_pickle import read_pickled_arrays
+from avatar.body.packed import add_atlas, atlas_arrays, holds_template
 from avatar.body.smpl import EXTRA_JOINTS, joint_tree
 from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.geometry.uv import check_atlas
 from avatar.io.npz import read_arrays, write_arrays
 
 SHAPE_COMPONENTS = {20: 10, 400: 300}  # SMPL-X stores expression blendshapes behind those of shape
@@ -20,18 +23,23 @@ REQUIRED_KEYS = {
     "f": "int F 3",
     "kintree_table": "int 2 J",
 }
-OPTIONAL_KEYS = {"posedirs": "number V 3 P"}
+OPTIONAL_KEYS = {"posedirs": "number V 3 P", "vt": "number U 2", "ft": "number F 3"}  # vt and ft are SMPL-X's atlas
 
 
-def convert_body_model(source: Path, target: Path) -> str:
+def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> str:
     """Converts a downloaded SMPL, SMPL-H or SMPL-X file to the plain npz that `avatar.body.smpl` reads.
+
+    A UV atlas, which POP and SCALE need, comes from the file where it has one (SMPL-X does), or from an OBJ file of
+    the same mesh with texture coordinates. With such an OBJ a ``template.npz`` of our own may be the source as well:
+    any body then gets an atlas.
 
     Args:
         source: the model file, ``.npz`` or ``.pkl``. Code and object arrays in it are never touched.
         target: the ``.npz`` to write.
+        uv: the OBJ file, if any; it comes before what the source has.
 
     Returns:
-        The kind of model it is: smpl, smplh or smplx.
+        The kind of model it is: smpl, smplh, smplx or packed (a ``template.npz``).
 
     Raises:
         DataError: naming the file, for a damaged or hostile one, missing keys, or shapes that do not fit.
@@ -42,14 +50,19 @@ def convert_body_model(source: Path, target: Path) -> str:
         raise AvatarError(f"target: expected a .npz file to write, got {target}.")
     if source.suffix not in (".npz", ".pkl"):
         raise DataError(source, f"expected a .npz or .pkl body model, got {source.suffix or 'no suffix'}.")
+    if uv is not None and source.suffix == ".npz" and holds_template(source):
+        add_atlas(source, target, uv)
+        return "packed"
     if source.suffix == ".npz":
         arrays = read_arrays(source, REQUIRED_KEYS, OPTIONAL_KEYS)
     else:
         arrays = read_pickled_arrays(source, REQUIRED_KEYS, OPTIONAL_KEYS)
     try:
-        plain = _plain_model(arrays)
+        plain = _plain_model(arrays if uv is None else {k: v for k, v in arrays.items() if k not in ("vt", "ft")})
     except AvatarError as error:
         raise DataError(source, str(error)) from error
+    if uv is not None:
+        plain |= atlas_arrays(uv, plain["faces"], len(plain["v_template"]))
     write_arrays(target, plain)
     return str(plain["kind"][0])
 
@@ -78,6 +91,11 @@ def _plain_model(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     for key, array in plain.items():
         check_finite(key, array)
     plain["faces"] = arrays["f"].astype(np.int32)
+    if "vt" in arrays and "ft" in arrays:
+        if not np.array_equal(arrays["ft"], np.rint(arrays["ft"])):  # some files keep whole numbers as floats
+            raise AvatarError("ft: expected whole numbers, got others.")
+        plain |= {"uv": arrays["vt"].astype(np.float32), "uv_faces": arrays["ft"].astype(np.int32)}
+        check_atlas(torch.from_numpy(plain["uv"]), torch.from_numpy(plain["uv_faces"]), dims["F"])
     plain["parents"] = np.array(parents, np.int32)
     plain["joint_names"] = np.array(joint_tree(kinds[0])[0])
     plain["kind"] = np.array(kinds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import torch
 from avatar.body.model import BodyModel, check_bind
 from avatar.body.skinning import check_parents
 from avatar.checks import AvatarError, DataError, check_shape
+from avatar.io.atlases import read_obj_atlas
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import Template
 
@@ -143,6 +145,38 @@ def packed_body(path: Path) -> BodyModel:
         return BodyModel(bind, torch.from_numpy(arrays["zero_from_bind"].astype(np.float32)))
     except AvatarError as error:
         raise DataError(path, str(error)) from error
+
+
+def holds_template(path: Path) -> bool:
+    """Whether a file looks like a ``template.npz``, sound or not."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {"vertices.npy", "parents.npy"} <= set(archive.namelist())
+    except (zipfile.BadZipFile, OSError):
+        return False
+
+
+def add_atlas(source: Path, target: Path, uv: Path) -> None:
+    """Copies a ``template.npz`` with the UV atlas that an OBJ file has for its mesh.
+
+    Raises:
+        DataError: for a template or an OBJ that is not sound, or not of one mesh.
+    """
+    packed_body(source)
+    arrays = read_arrays(source, REQUIRED_KEYS, OPTIONAL_KEYS)
+    write_arrays(target, arrays | atlas_arrays(uv, arrays["faces"], len(arrays["vertices"])))
+
+
+def atlas_arrays(uv: Path, faces: np.ndarray, vertices: int) -> dict[str, np.ndarray]:
+    """The UV atlas of an OBJ file as the arrays of a body's file.
+
+    Raises:
+        DataError: for an OBJ without texture coordinates or of another mesh.
+    """
+    atlas = read_obj_atlas(uv, faces, vertices)
+    if atlas is None:
+        raise DataError(uv, "it has no texture coordinates.", "Export it with UVs (lines that begin with vt).")
+    return {"uv": atlas.uv, "uv_faces": atlas.uv_faces.astype(np.int32)}
 
 
 def _template_arrays(template: Template) -> dict[str, np.ndarray]:

@@ -33,7 +33,7 @@ REQUIRED_KEYS = {
     "parents": "int J",
     "joint_names": "text J",
 }
-OPTIONAL_KEYS = {"posedirs": "float V 3 P"}
+OPTIONAL_KEYS = {"posedirs": "float V 3 P", "uv": "float U 2", "uv_faces": "int F 3"}
 
 
 def _hands(first: int) -> dict[str, int]:
@@ -99,11 +99,12 @@ def smpl_body(
         posedirs = None if posedirs is None else posedirs[..., : 9 * (count - 1)]
     bind = Template(
         vertices=_float32(vertices),
-        faces=torch.from_numpy(model["faces"].astype(np.int64)),
+        faces=_int64(model["faces"]),
         weights=_float32(weights / weights.sum(axis=1, keepdims=True)),
         joints=_float32(joints),
         parents=parents,
         joint_names=names,
+        **({"uv": _float32(model["uv"]), "uv_faces": _int64(model["uv_faces"])} if "uv" in model else {}),
     )
     try:
         return BodyModel(bind, None, canonical_pose, None if posedirs is None else _float32(posedirs))
@@ -142,6 +143,11 @@ def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
     if stored not in EXTRA_JOINTS or tuple(model["parents"]) != joint_tree(stored)[1]:
         raise DataError(path, f"expected the joints of smpl, smplh or smplx, got {stored} with others.", mend)
     return model
+
+
+def _int64(array: np.ndarray) -> Tensor:
+    """An int64 tensor of an array."""
+    return torch.from_numpy(array.astype(np.int64))
 
 
 def _float32(array: np.ndarray) -> Tensor:

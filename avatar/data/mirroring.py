@@ -56,22 +56,20 @@ def swap_side(name: str) -> str:
 def mirror_batch(batch: Batch, chosen: Tensor, symmetry: MirrorMap) -> Batch:
     """The batch with the chosen frames ``(B,)`` bool seen in a mirror: bodies, transforms and scans alike."""
     flip = ACROSS.diagonal()[:3]
-    transforms = ACROSS @ batch.vertex_transforms[:, symmetry.vertices] @ ACROSS
-    joints = ACROSS @ batch.joint_transforms[:, symmetry.joints] @ ACROSS
-    mirrored = {
-        "pose_vertices": batch.pose_vertices[:, symmetry.vertices] * flip,
-        "vertices": batch.vertices[:, symmetry.vertices] * flip,
-        "vertex_transforms": transforms,
-        "joint_transforms": joints,
-        "scan_points": batch.scan_points * flip,
-        "scan_normals": batch.scan_normals * flip,
+    turned = torch.outer(ACROSS.diagonal(), ACROSS.diagonal())  # signs of ACROSS @ T @ ACROSS
+    images = {
+        "pose_vertices": lambda seen: seen[:, symmetry.vertices] * flip,
+        "vertices": lambda seen: seen[:, symmetry.vertices] * flip,
+        "vertex_transforms": lambda seen: seen[:, symmetry.vertices] * turned,
+        "joint_transforms": lambda seen: seen[:, symmetry.joints] * turned,
+        "scan_points": lambda seen: seen * flip,
+        "scan_normals": lambda seen: seen * flip,
     }
-
-    def pick(name: str) -> Tensor:
-        value = getattr(batch, name)
-        return torch.where(chosen.view(-1, *[1] * (value.ndim - 1)), mirrored[name], value)
-
-    return replace(batch, **{name: pick(name) for name in mirrored})
+    rows = chosen.nonzero()[:, 0]
+    mirrored = {name: getattr(batch, name).clone() for name in images}
+    for name, image in images.items():
+        mirrored[name][rows] = image(mirrored[name][rows])
+    return replace(batch, **mirrored)
 
 
 def mirror_coins(seed: int, step: int, frames: int) -> Tensor:

@@ -17,6 +17,7 @@ from avatar.checks import AvatarError, DataError, check_shape, require
 from avatar.data.outfits import OUTFIT_FORMAT, SPLITS, Outfit
 from avatar.data.soundness import check_pose
 from avatar.geometry.transforms import invert_rigid, transform_points
+from avatar.io.atlases import read_obj_atlas
 from avatar.io.frames import write_manifest
 from avatar.io.meshes import read_mesh
 from avatar.io.npz import read_arrays, write_arrays, write_whole
@@ -218,18 +219,22 @@ def _check_stored_pose(pose: np.ndarray, joints: int, path: Path) -> None:
 
 
 def _template_of_mesh(path: Path) -> Template:
-    """A body that is only a mesh: everything hangs on one root joint at the origin."""
+    """A body that is only a mesh, with its UV atlas if it has one: everything hangs on one root joint at the origin."""
     if not path.is_file():
         problem = "expected template.npz or template.obj (the minimal body in its T-pose), there is neither."
         raise DataError(path.parent, problem, "Make one with tools/convert_body.py.")
     mesh = read_mesh(path)
+    faces = np.asarray(mesh.faces, np.int64)
+    atlas = read_obj_atlas(path, faces, len(mesh.vertices))
     return Template(
         vertices=torch.from_numpy(np.asarray(mesh.vertices, np.float32)),
-        faces=torch.from_numpy(np.asarray(mesh.faces, np.int64)),
+        faces=torch.from_numpy(faces),
         weights=torch.ones(len(mesh.vertices), 1),
         joints=torch.zeros(1, 3),
         parents=(-1,),
         joint_names=("root",),
+        uv=None if atlas is None else torch.from_numpy(atlas.uv),
+        uv_faces=None if atlas is None else torch.from_numpy(atlas.uv_faces),
     )
 
 

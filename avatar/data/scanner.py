@@ -148,17 +148,15 @@ def facing_partners(points: np.ndarray, normals: np.ndarray, distance: float) ->
     Returns:
         Two index arrays ``(K,)``: the points, and for each the nearest point ahead of it that faces it.
     """
-    reach = 64  # nearest points looked at; the facing surface is among them where the gap is narrow
-    tree = cKDTree(points)
-    distances, ids = tree.query(points, k=min(reach, len(points)), distance_upper_bound=distance)
-    known = np.isfinite(distances)
-    ids = np.where(known, ids, 0)
-    across = points[ids] - points[:, None]
-    ahead = np.einsum("mkc,mc->mk", across, normals) > 0.5 * np.where(known, distances, np.inf)
-    facing = np.einsum("mkc,mc->mk", normals[ids], normals) < FACING
-    met = known & ahead & facing
-    moving = np.flatnonzero(met.any(axis=1))
-    return moving, ids[moving, met[moving].argmax(axis=1)]
+    pairs = cKDTree(points, balanced_tree=False).query_pairs(distance, output_type="ndarray")
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pairs = pairs[np.einsum("kc,kc->k", normals[pairs[:, 0]], normals[pairs[:, 1]]) < FACING]
+    across = points[pairs[:, 1]] - points[pairs[:, 0]]
+    gaps = np.linalg.norm(across, axis=1)
+    ahead = np.einsum("kc,kc->k", across, normals[pairs[:, 0]]) > 0.5 * gaps
+    pairs = pairs[ahead][np.argsort(gaps[ahead], kind="stable")]
+    moving, first = np.unique(pairs[:, 0], return_index=True)
+    return moving, pairs[first, 1]
 
 
 def outside_holes(points: np.ndarray, holes: int, radius: float, rng: np.random.Generator) -> np.ndarray:

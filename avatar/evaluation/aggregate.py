@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +33,11 @@ class Interval:
     high: float
     confidence: float
     frames: int
+
+    def written(self, scale: float) -> str:
+        """The difference and its interval as printed, in units ``1 / scale`` of the metric's."""
+        values = (self.difference * scale, self.low * scale, self.high * scale)
+        return "{:+.3f} [{:+.3f}, {:+.3f}]".format(*values)
 
 
 def method_key(row: Score | FrameScore) -> str:
@@ -127,9 +132,17 @@ def bootstrap_difference(
             outfits[outfit].append(float(np.mean(pair[first]) - np.mean(pair[second])))
     if not outfits:
         raise AvatarError(f"frames: {first} and {second} have no frame of {metric} in common.")
-    count = sum(len(pairs) for pairs in outfits.values())
+    return bootstrap_mean(outfits.values(), resamples, confidence, seed)
+
+
+def bootstrap_mean(
+    groups: Iterable[Sequence[float]], resamples: int = 2000, confidence: float = 0.95, seed: int = 0
+) -> Interval:
+    """The mean of all values with its percentile bootstrap interval; values are redrawn within their group."""
+    groups = [np.asarray(values, np.float64) for values in groups]
+    count = sum(map(len, groups))
     generator, sums = np.random.default_rng(seed), np.zeros(resamples)
-    for pairs in outfits.values():
-        sums += np.array(pairs)[generator.integers(len(pairs), size=(resamples, len(pairs)))].sum(axis=1)
+    for values in groups:
+        sums += values[generator.integers(len(values), size=(resamples, len(values)))].sum(axis=1)
     low, high = np.quantile(sums / count, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(sum(map(sum, outfits.values())) / count, float(low), float(high), confidence, count)
+    return Interval(float(sum(v.sum() for v in groups)) / count, float(low), float(high), confidence, count)

@@ -33,8 +33,8 @@ def plot_losses(metrics_csv: str | Path) -> Figure:
     Raises:
         DataError: when the log is missing, lacks ``split`` and ``step``, or holds no number.
     """
-    curves = _read_curves(Path(metrics_csv))
-    figure, panels = _panels(len(curves))
+    curves = read_curves(Path(metrics_csv))
+    figure, panels = make_panels(len(curves))
     for panel, (term, splits) in zip(panels, curves.items()):
         for colour, (split, points) in zip(COLOURS, splits.items()):
             steps, values = np.array(points).T
@@ -45,7 +45,7 @@ def plot_losses(metrics_csv: str | Path) -> Figure:
             panel.set_yscale("log")
         panel.set_title(term, fontsize=9, color=INK)
         panel.set_xlabel("step", fontsize=8, color=INK)
-    _add_legend(figure, panels[0])
+    add_legend(figure, panels[0])
     return figure
 
 
@@ -54,7 +54,7 @@ def plot_outfits(rows: Sequence[Score], metric: str) -> Figure:
     (known,) = find_metrics([metric])
     grid = tabulate(rows, metric)
     methods = order_methods({method for cells in grid.values() for method in cells})
-    figure, (panel,) = _panels(1, (max(5.0, 1.2 + 0.9 * len(grid) * max(1, len(methods) / 3)), 3.0))
+    figure, (panel,) = make_panels(1, (max(5.0, 1.2 + 0.9 * len(grid) * max(1, len(methods) / 3)), 3.0))
     width = 0.8 / len(methods)
     for place, method in enumerate(methods):
         bars = [(x, cells[method]) for x, cells in enumerate(grid.values()) if method in cells]
@@ -63,7 +63,7 @@ def plot_outfits(rows: Sequence[Score], metric: str) -> Figure:
         panel.bar(left, heights, 0.92 * width, color=COLOURS[place % len(COLOURS)], label=method)
     panel.set_xticks(range(len(grid)), list(grid), fontsize=8)
     panel.set_ylabel(f"{known.name} ({known.shown_in})", fontsize=8, color=INK)
-    _add_legend(figure, panel)
+    add_legend(figure, panel)
     return figure
 
 
@@ -77,14 +77,14 @@ def plot_frames(frames: Sequence[FrameScore], metric: str, outfit: str) -> Figur
     if not lines:
         raise AvatarError(f"frames: no score of {metric} on {outfit}.")
     names = sorted({name for values in lines.values() for name in values})
-    figure, (panel,) = _panels(1, (7.2, 3.0))
+    figure, (panel,) = make_panels(1, (7.2, 3.0))
     for place, method in enumerate(order_methods(set(lines))):
         heights = [lines[method].get(name, np.nan) for name in names]
         panel.plot(heights, color=COLOURS[place % len(COLOURS)], linewidth=1.4, marker="o", markersize=3, label=method)
     step = -(-len(names) // 24)
     panel.set_xticks(range(0, len(names), step), names[::step], fontsize=6, rotation=60, ha="right")
     panel.set_ylabel(f"{known.name} ({known.shown_in})", fontsize=8, color=INK)
-    _add_legend(figure, panel)
+    add_legend(figure, panel)
     return figure
 
 
@@ -116,20 +116,24 @@ def inline_svg(figure: Figure, prefix: str, title: str) -> str:
     return (root + svg[svg.index(">") + 1 :]).replace("xlink:href", "href")
 
 
-def _read_curves(path: Path) -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """Term to split to (step, value) points."""
+def read_curves(path: Path, against: str = "step") -> dict[str, dict[str, list[tuple[float, float]]]]:
+    """A training log as term to split to (step or seconds, value) points.
+
+    Raises:
+        DataError: when the log is missing, lacks a column, or holds no number.
+    """
     if not path.is_file():
         raise DataError(path, "there is no training log here.", "Train first.")
     curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         names = reader.fieldnames or []
-        if not {"split", "step"} <= set(names):
-            raise DataError(path, f"expected the columns split and step, got {', '.join(names) or 'none'}.")
+        if not {"split", against} <= set(names):
+            raise DataError(path, f"expected the columns split and {against}, got {', '.join(names) or 'none'}.")
         for row in reader:
             for term in (name for name in names if name not in LOG_COLUMNS and row[name]):
                 try:
-                    point = (float(row["step"]), float(row[term]))
+                    point = (float(row[against]), float(row[term]))
                 except ValueError as error:
                     raise DataError(path, f"line {reader.line_num}, {term}: {error}.") from error
                 curves.setdefault(term, {}).setdefault(row["split"], []).append(point)
@@ -138,7 +142,7 @@ def _read_curves(path: Path) -> dict[str, dict[str, list[tuple[float, float]]]]:
     return curves
 
 
-def _panels(count: int, size: tuple[float, float] | None = None) -> tuple[Figure, list[Axes]]:
+def make_panels(count: int, size: tuple[float, float] | None = None) -> tuple[Figure, list[Axes]]:
     """A figure with panels in rows of three, in the house's style."""
     columns = min(3, count)
     rows = -(-count // columns)
@@ -154,6 +158,6 @@ def _panels(count: int, size: tuple[float, float] | None = None) -> tuple[Figure
     return figure, panels
 
 
-def _add_legend(figure: Figure, panel: Axes) -> None:
+def add_legend(figure: Figure, panel: Axes) -> None:
     handles, labels = panel.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=8, frameon=False, fontsize=8, labelcolor=INK)

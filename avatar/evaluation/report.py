@@ -146,7 +146,7 @@ def _metrics(content: ReportContent) -> str:
 
 
 def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in (table.corner, *table.columns))
+    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in (table.corner, *table.heads))
     rows = [
         ('<tr class="summary">' if row.summary else "<tr>")
         + f'<th scope="row">{escape(row.label)}</th>'

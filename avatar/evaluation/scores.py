@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass, field, fields
+from dataclasses import MISSING, astuple, dataclass, field, fields
 from pathlib import Path
 from typing import TypeVar, get_type_hints
 
@@ -20,7 +20,8 @@ class Score:
     """One number of a results table: a metric's mean over the frames of one outfit for one method.
 
     ``variant`` tells settings of a method apart, ``seed``, ``steps`` and ``seconds`` are those of its training,
-    ``points`` is the mean count of predicted points, ``commit`` the code that made it.
+    ``points`` is the mean count of predicted points, ``commit`` the code that made it, ``dataset`` the outfit's,
+    ``fraction`` the share of the training frames that was trained on. Files without the last two are older.
     """
 
     table: str
@@ -36,6 +37,8 @@ class Score:
     seconds: float
     points: int
     commit: str
+    dataset: str = ""
+    fraction: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -103,15 +106,17 @@ def _to_csv(kind: type[Row], rows: Iterable[Row]) -> bytes:
 
 def _from_csv(kind: type[Row], path: Path) -> list[Row]:
     columns = get_type_hints(kind)
+    needed = {f.name for f in fields(kind) if f.default is MISSING}
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        missing = [name for name in columns if name not in (reader.fieldnames or [])]
+        given = [name for name in columns if name in (reader.fieldnames or [])]
+        missing = [name for name in columns if name in needed.difference(given)]
         if missing:
             raise DataError(path, f"expected the columns {', '.join(columns)}; {', '.join(missing)} missing.")
         rows = []
         for line in reader:
             try:
-                rows.append(kind(**{name: parse(line[name]) for name, parse in columns.items()}))
+                rows.append(kind(**{name: columns[name](line[name]) for name in given}))
             except (TypeError, ValueError) as error:
                 raise DataError(path, f"line {reader.line_num} cannot be read ({error}).") from error
     return rows

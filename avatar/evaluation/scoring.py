@@ -72,6 +72,7 @@ class Label:
     steps: int = 0
     seconds: float = 0.0
     commit: str = ""
+    fraction: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -268,7 +269,7 @@ def score_frames(
             FrameScore(outfit.name, label.method, label.variant, label.seed, name, metric, float(value))
             for metric, value in values.items()
         ]
-    return Scores(_means(frames, metrics, label, round(float(np.mean(counts)))), frames)
+    return Scores(_means(frames, metrics, label, outfit.dataset, round(float(np.mean(counts)))), frames)
 
 
 def _in_time(name: str) -> tuple[str, int, str]:
@@ -288,7 +289,7 @@ def _measure_sequence(metrics: list[Metric], window: list[tuple[str, torch.Tenso
     return {metric.name: metric.measure(torch.stack(clouds)) for metric in metrics}
 
 
-def _means(frames: list[FrameScore], metrics: list[Metric], label: Label, points: int) -> list[Score]:
+def _means(frames: list[FrameScore], metrics: list[Metric], label: Label, dataset: str, points: int) -> list[Score]:
     rows = []
     for metric in metrics:
         values = [frame.value for frame in frames if frame.metric == metric.name]
@@ -308,6 +309,8 @@ def _means(frames: list[FrameScore], metrics: list[Metric], label: Label, points
                     seconds=label.seconds,
                     points=points,
                     commit=label.commit,
+                    dataset=dataset,
+                    fraction=label.fraction,
                 )
             )
     return rows

@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import groupby
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from avatar.evaluation.aggregate import (
     Cell,
     base_method,
     frame_weighted_mean,
+    method_key,
     order_methods,
     tabulate,
     worst_outfit,
@@ -37,28 +39,43 @@ BASES = {View.OF_BODY: "body", View.OF_STATIC: "static"}
 
 @dataclass(frozen=True)
 class TableRow:
-    """A labelled row; None stands where there is no number. ``summary`` rows are set off from the others."""
+    """A labelled row; None stands where there is no number. ``summary`` rows are set off from the others.
+
+    ``texts`` are printed in the numbers' place where there is more to say.
+    """
 
     label: str
     values: tuple[float | None, ...]
     decimals: int = 3
     summary: bool = False
+    texts: tuple[str, ...] | None = None
 
     @property
     def cells(self) -> tuple[str, ...]:
         """The numbers as printed."""
+        if self.texts is not None:
+            return self.texts
         return tuple("–" if value is None else f"{value:.{self.decimals}f}" for value in self.values)
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table ready to print: ``corner`` heads the labels, ``notes`` hold the definitions printed below."""
+    """A table ready to print: ``corner`` heads the labels, ``notes`` hold the definitions printed below.
+
+    ``groups``, where there are any, stand above the columns: one a column, equal neighbours as one heading.
+    """
 
     title: str
     corner: str
     columns: tuple[str, ...]
     rows: tuple[TableRow, ...]
     notes: tuple[str, ...]
+    groups: tuple[str, ...] = ()
+
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """The columns by their full names."""
+        return tuple(f"{group}, {column}" for group, column in zip(self.groups, self.columns)) or self.columns
 
 
 def outfit_table(rows: Sequence[Score], metric: str, view: View = View.VALUE) -> Table:
@@ -85,7 +102,8 @@ def outfit_table(rows: Sequence[Score], metric: str, view: View = View.VALUE) ->
     body.append(TableRow("min over outfits" if falls else "max over outfits", worst, summary=True))
     unit = "ratio" if view in BASES else known.shown_in
     title = f"{known.name}, {view.value} ({unit})"
-    return Table(title, "outfit", tuple(methods), tuple(body), (*_notes(known, view), *_point_notes(grid)))
+    notes = (*_notes(known, view), *_point_notes(grid), *seed_notes(rows))
+    return Table(title, "outfit", tuple(methods), tuple(body), notes)
 
 
 def metric_table(rows: Sequence[Score], outfit: str, metrics: Sequence[str] = tuple(METRICS)) -> Table:
@@ -125,10 +143,12 @@ def _viewed(cells: dict[str, Cell], metric: Metric, view: View) -> dict[str, Cel
     excess = {method: Cell(c.value - floor.value, c.frames, c.points) for method, c in cells.items()}
     if view is View.EXCESS:
         return {method: Cell(c.value * metric.scale, c.frames, c.points) for method, c in excess.items()}
-    base = _find_floor(excess, BASES[view])
-    if base is None or base.value == 0:
-        return {}
-    return {method: Cell(c.value / base.value, c.frames, c.points) for method, c in excess.items()}
+    bases = {method: _find_base(excess, method, BASES[view]) for method in excess}
+    return {
+        method: Cell(c.value / base.value, c.frames, c.points)
+        for method, c in excess.items()
+        if (base := bases[method]) is not None and base.value != 0
+    }
 
 
 def _value(cells: dict[str, Cell], method: str) -> float | None:
@@ -142,6 +162,15 @@ def _plain_mean(cells: Sequence[Cell]) -> float:
 def _find_floor(cells: dict[str, Cell], floor: str) -> Cell | None:
     """A floor's cell, whatever its variant."""
     return next((cell for method, cell in cells.items() if base_method(method) == floor), None)
+
+
+def _find_base(cells: dict[str, Cell], method: str, floor: str) -> Cell | None:
+    """The floor a method is measured by: that of its own variant, or the only one there is."""
+    variant = method.removeprefix(base_method(method))
+    floors = [key for key in cells if base_method(key) == floor]
+    if len(floors) > 1:
+        floors = [key for key in floors if key == floor + variant]
+    return cells[floors[0]] if floors else None
 
 
 def _check_floor(methods: list[str], floor: str, view: View) -> None:
@@ -168,9 +197,18 @@ def _point_notes(grid: dict[str, dict[str, Cell]]) -> list[str]:
     return [f"Point counts differ, and with them the sampling floor: {listed}."]
 
 
+def seed_notes(rows: Sequence[Score]) -> list[str]:
+    """Which methods' numbers are means over several trainings."""
+    seeds: dict[str, set[int]] = {}
+    for row in rows:
+        seeds.setdefault(method_key(row), set()).add(row.seed)
+    several = {method: sorted(found) for method, found in seeds.items() if len(found) > 1}
+    return [f"Mean over seeds: {m} {', '.join(map(str, found))}." for m, found in several.items()]
+
+
 def to_markdown(table: Table) -> str:
     """The table as GitHub Markdown: title, table, notes."""
-    lines = [f"**{table.title}**", "", _pipes((table.corner, *table.columns))]
+    lines = [f"**{table.title}**", "", _pipes((table.corner, *table.heads))]
     lines.append("|---" + "|---:" * len(table.columns) + "|")
     for row in table.rows:
         cells = (row.label, *row.cells)
@@ -186,7 +224,7 @@ def to_csv(table: Table) -> str:
     """The table as CSV with full precision, without title and notes; empty where there is no number."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((table.corner, *table.columns))
+    writer.writerow((table.corner, *table.heads))
     writer.writerows((row.label, *("" if v is None else repr(v) for v in row.values)) for row in table.rows)
     return text.getvalue()
 
@@ -195,7 +233,8 @@ def to_latex(table: Table) -> str:
     """The table as a LaTeX ``table`` for booktabs, its notes in the caption."""
     columns = "l" + "r" * len(table.columns)
     head = " & ".join(map(_escape, (table.corner, *table.columns)))
-    lines = ["\\begin{table}", "\\centering", f"\\begin{{tabular}}{{{columns}}}", "\\toprule", f"{head} \\\\"]
+    lines = ["\\begin{table}", "\\centering", f"\\begin{{tabular}}{{{columns}}}", "\\toprule", *_group_lines(table)]
+    lines.append(f"{head} \\\\")
     ruled = None
     for row in table.rows:
         if row.summary != ruled:
@@ -204,6 +243,17 @@ def to_latex(table: Table) -> str:
         lines.append(" & ".join(map(_escape, (row.label, *row.cells))) + " \\\\")
     caption = " ".join(map(_escape, (f"{table.title}.", *table.notes)))
     return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", f"\\caption{{{caption}}}", "\\end{table}", ""])
+
+
+def _group_lines(table: Table) -> list[str]:
+    """The headings above the columns, each with a rule below it."""
+    heads, rules, column = [], [], 2
+    for group, members in groupby(table.groups):
+        width = len(list(members))
+        heads.append(f"\\multicolumn{{{width}}}{{c}}{{{_escape(group)}}}")
+        rules.append(f"\\cmidrule(lr){{{column}-{column + width - 1}}}")
+        column += width
+    return [" & ".join(["", *heads]).strip() + " \\\\", " ".join(rules)] if heads else []
 
 
 LATEX = {

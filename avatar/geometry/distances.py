@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from avatar.checks import check_shape
-from avatar.geometry.neighbours import nearest
+from avatar.geometry.neighbours import nearest_both_ways
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Correspondences:
 
 def correspond(points: Tensor, scan: Tensor) -> Correspondences:
     """Nearest neighbours between predicted points ``(B, N, 3)`` and scan points ``(B, M, 3)``, both ways."""
-    return Correspondences(nearest(points, scan), nearest(scan, points))
+    return Correspondences(*nearest_both_ways(points, scan))
 
 
 def gather_points(values: Tensor, ids: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.bags import Bags, sum_bags
 from avatar.records import SurfaceSamples
 
 
@@ -67,15 +68,11 @@ def sample_surface(vertices: Tensor, faces: Tensor, count: int, generator: torch
 def interpolate(values: Tensor, samples: SurfaceSamples) -> Tensor:
     """Barycentric interpolation of per-vertex values (CloSET eq. 2). ``(..., V, C)`` to ``(..., N, C)``.
 
-    Weighted gathers, one corner at a time: differentiable, and no ``(N, 3, C)`` array is ever made.
+    Weighted sums of three rows: differentiable, and no ``(N, 3, C)`` array is ever made.
     """
     check_shape("values", values, "... V C")
-    weights = samples.barycentric.to(values.dtype)
-    ids = samples.vertex_ids
-    blended = values.index_select(-2, ids[:, 0]) * weights[:, :1]
-    for corner in (1, 2):
-        blended = blended + values.index_select(-2, ids[:, corner]) * weights[:, corner : corner + 1]
-    return blended
+    bags = Bags.of_table(samples.vertex_ids, values.shape[-2], samples.barycentric)
+    return sum_bags(values, bags)
 
 
 def interpolate_transforms(transforms: Tensor, samples: SurfaceSamples) -> Tensor:

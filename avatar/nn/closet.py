@@ -169,14 +169,15 @@ class ClosetAvatar(nn.Module):
 
         scale = self.config.offset_scale
         offsets = (local.offsets * scale).float()
+        apart = self.config.template and self.config.pose and wrinkles  # alone they are the whole, not a part of it
         posed = self.carry(Decoded(offsets, local.normals.float()), batch, samples)
         return Prediction(
             points=posed.offsets,
             normals=posed.normals,
             offsets=offsets,
             garment_offsets=parts[0].offsets.float() * scale if self.config.template else None,
-            wrinkle_offsets=parts[-1].offsets.float() * scale if self.config.pose and wrinkles else None,
-            wrinkle_normals=parts[-1].normals.float() if self.config.pose and wrinkles else None,
+            wrinkle_offsets=parts[-1].offsets.float() * scale if apart else None,
+            wrinkle_normals=parts[-1].normals.float() if apart else None,
             codes=codes,
         )
 

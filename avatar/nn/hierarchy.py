@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.bags import Bags, sum_bags
 from avatar.geometry.neighbours import ball_query, k_nearest
 from avatar.geometry.sampling import farthest_points
 
@@ -31,12 +32,43 @@ class HierarchyConfig:
             )
 
 
+class FixedBags(nn.Module):
+    """Sums of bags that stay the same for good, with their transpose made once: ``(..., V, C)`` to ``(..., R, C)``."""
+
+    def __init__(self, bags: Bags):
+        super().__init__()
+        self.rows, back = bags.rows, bags.transpose()
+        self.register_buffer("ids", bags.ids, persistent=False)
+        self.register_buffer("starts", bags.starts, persistent=False)
+        self.register_buffer("weights", bags.weights, persistent=False)
+        self.register_buffer("back_ids", back.ids, persistent=False)
+        self.register_buffer("back_starts", back.starts, persistent=False)
+        self.register_buffer("back_weights", back.weights, persistent=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        bags = Bags(self.ids, self.starts, self.weights, self.rows)
+        back = Bags(self.back_ids, self.back_starts, self.back_weights, len(self.starts))
+        return sum_bags(values, bags, back)
+
+
+class Grouping(nn.Module):
+    """Picks constant groups of rows, ``(B, N, C)`` to ``(B, S, K, C)`` for ids ``(S, K)``."""
+
+    def __init__(self, groups: Tensor, rows: int):
+        super().__init__()
+        self.shape = groups.shape
+        self.pick = FixedBags(Bags.of_table(groups.reshape(-1, 1), rows))
+
+    def forward(self, values: Tensor) -> Tensor:
+        return self.pick(values).unflatten(1, self.shape)
+
+
 class Level(nn.Module):
     """One step of a hierarchy: how to gather from the finer level, and how to interpolate back to it.
 
     Buffers: ``positions (S, 3)`` of this level's points, ``finer_positions (N, 3)``, ``groups (S, K)`` ball-query
     neighbours in the finer level, ``up_ids (N, 3)`` and ``up_weights (N, 3)`` inverse-squared-distance weights of
-    the three nearest coarse points (PointNet++ eq. 2).
+    the three nearest coarse points (PointNet++ eq. 2). ``group`` and ``spread`` are what is done with them.
     """
 
     def __init__(self, finer: Tensor, count: int, radius: float, neighbours: int):
@@ -52,6 +84,8 @@ class Level(nn.Module):
             "up_weights": inverse / inverse.sum(dim=1, keepdim=True),
         }.items():
             self.register_buffer(name, value.clone(), persistent=False)
+        self.group = Grouping(self.groups, len(finer))
+        self.spread = FixedBags(Bags.of_table(self.up_ids, count, self.up_weights))
 
 
 def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:

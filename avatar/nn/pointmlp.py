@@ -71,7 +71,7 @@ class PointMLPLevel(nn.Module):
         positions = self.level.finer_positions.to(features.dtype).expand(len(features), -1, -1)
         joined = torch.cat([features, positions], dim=-1)
         centres = joined[:, self.own]
-        grouped = self.difference_layer(self.affine(joined[:, self.level.groups], centres))
+        grouped = self.difference_layer(self.affine(self.level.group(joined), centres))
         lifted = relu(self.norm(grouped + self.centre_layer(centres).unsqueeze(2)))
         return self.after(self.before(lifted).amax(dim=2))
 

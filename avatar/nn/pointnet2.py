@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, field
 
-import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from avatar.checks import AvatarError, check_shape
 from avatar.nn.hierarchy import HierarchyConfig, Level, build_levels
@@ -80,12 +80,16 @@ class SetAbstraction(nn.Module):
         """``(B, N, C)`` features of the finer level to ``(B, S, C')`` of the coarser."""
         level = self.level
         lifted = self.feature_layer(features) + self.position_layer(level.finer_positions)
-        grouped = lifted[:, level.groups] - self.position_layer(level.positions)[:, None]
+        grouped = level.group(lifted) - self.position_layer(level.positions)[:, None]
         return self.rest(self.first(grouped)).amax(dim=2)
 
 
 class FeaturePropagation(nn.Module):
-    """Interpolates coarse features to the finer level, joins the finer level's own and maps both."""
+    """Interpolates coarse features to the finer level, joins the finer level's own and maps both.
+
+    The first layer sees [interpolated, own] and is linear, as interpolation is, so its first half comes before it,
+    where there are fewer points: W_c (sum_k w_k c_k) = sum_k w_k (W_c c_k), exactly.
+    """
 
     def __init__(self, level: Level, coarse_channels: int, fine_channels: int, widths: tuple[int, ...]):
         super().__init__()
@@ -94,12 +98,12 @@ class FeaturePropagation(nn.Module):
 
     def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
         """``(B, S, C)`` and ``(B, N, C')`` to ``(B, N, C'')``."""
-        level = self.level
-        weights = level.up_weights.to(coarse.dtype)
-        spread = coarse[:, level.up_ids[:, 0]] * weights[:, :1]
-        for corner in range(1, weights.shape[1]):
-            spread = spread + coarse[:, level.up_ids[:, corner]] * weights[:, corner : corner + 1]
-        return self.mlp(torch.cat([spread, fine], dim=-1))
+        first, *rest = self.mlp
+        mixing, adding = first.weight.split([coarse.shape[-1], fine.shape[-1]], dim=1)
+        lifted = self.level.spread(linear(coarse, mixing)) + linear(fine, adding, first.bias)
+        for layer in rest:
+            lifted = layer(lifted)
+        return lifted
 
 
 class PointNet2(nn.Module):

@@ -7,7 +7,7 @@ from torch.nn.functional import relu
 
 from avatar.checks import check_shape
 from avatar.geometry.neighbours import ball_query
-from avatar.nn.hierarchy import build_levels
+from avatar.nn.hierarchy import Grouping, build_levels
 from avatar.nn.pointnet2 import FeaturePropagation, PointNet2Config, PointNorm, SetAbstraction, point_mlp
 from avatar.records import Template
 
@@ -15,7 +15,7 @@ from avatar.records import Template
 class Neighbourhoods(nn.Module):
     """Groups of points around centres with positions in units of the groups' radius, so that all scales look alike.
 
-    Buffers as a `Level` has them: ``positions (S, 3)``, ``finer_positions (N, 3)``, ``groups (S, K)``.
+    Buffers as a `Level` has them: ``positions (S, 3)``, ``finer_positions (N, 3)``, ``groups (S, K)``; and ``group``.
     """
 
     def __init__(self, centres: Tensor, points: Tensor, groups: Tensor, radius: float):
@@ -23,6 +23,7 @@ class Neighbourhoods(nn.Module):
         self.register_buffer("positions", centres / radius, persistent=False)
         self.register_buffer("finer_positions", points / radius, persistent=False)
         self.register_buffer("groups", groups.clone(), persistent=False)
+        self.group = Grouping(self.groups, len(points))
 
 
 class InvertedResidual(nn.Module):

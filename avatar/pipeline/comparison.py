@@ -1,4 +1,4 @@
-"""`compare`: the scores of many runs as one table, in a tidy CSV and as Markdown."""
+"""`compare`: the scores of many runs in one table: tidy CSV, Markdown, LaTeX, differences, plots and pictures."""
 
 from __future__ import annotations
 
@@ -6,62 +6,203 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from avatar.checks import AvatarError, check_name
-from avatar.evaluation.scores import Scores, read_scores, write_scores
-from avatar.evaluation.tables import View, outfit_table, to_markdown
+import yaml
+
+from avatar.checks import AvatarError, DataError, check_name
+from avatar.evaluation.aggregate import FLOORS, method_key
+from avatar.evaluation.canonical_scores import canonical_table
+from avatar.evaluation.curves import plot_fractions, plot_progress, plot_times
+from avatar.evaluation.differences import budget_table, compare_methods, difference_table, differences_csv
+from avatar.evaluation.forms import FormConfig, ReportedTable, form_table, reported_table
+from avatar.evaluation.metrics import find_metrics
+from avatar.evaluation.plots import plot_outfits, save_figure
+from avatar.evaluation.scores import Score, Scores, read_scores, write_scores
+from avatar.evaluation.tables import Table, View, outfit_table, to_latex, to_markdown
 from avatar.io.npz import write_whole
+from avatar.pipeline.pose_grid import draw_pose_grid
 
 
 @dataclass
 class CompareConfig:
-    """A table over runs: every scored run below ``runs_root`` with one of the names, and the floors."""
+    """A table over runs: those listed, or every scored run below ``runs_root`` with the name; and their floors."""
 
     table: str = "main"  # the name of the table's files
+    runs: tuple[Path, ...] = ()  # folders of runs, or of scored predictions of foreign programs
     runs_root: Path = Path("runs")
-    dataset: tuple[str, ...] = ("sample",)  # one or several; outfits of one name in two would share a row
-    name: str = "default"  # runs of this name
+    dataset: tuple[str, ...] = ("sample",)  # where runs are not listed: one or several
+    name: str = "default"  # and runs of this name
     methods: tuple[str, ...] = ("static", "closet")
     metrics: tuple[str, ...] = ("cd_point", "cd_pop", "normal_l1_mean", "penetration_share", "uniformity")
+    form: FormConfig | None = None  # of one table of all metrics; null gives outfits by methods, a table a metric
+    baseline: str = ""  # the method that others are set against, with bootstrap intervals; empty for none
+    resamples: int = 2000  # of the bootstrap
+    confidence: float = 0.95
+    reported: ReportedTable | None = None  # what the paper's table says
+    canonicalizers: tuple[Path, ...] = ()  # folders of scored canonicalizers (tools/canonicalize.py scored=...)
+    plots: bool = True
+    pictures: int = 3  # unseen poses an outfit in the picture of all methods; 0 for none
+    split: str = "test"  # whose predictions are in the picture
+    data_root: Path | None = None  # where the data are now; where they were at training if null
     out: Path = Path("docs/results")
 
     def __post_init__(self):
         check_name("table", self.table)
+        if self.pictures < 0 or self.resamples < 100 or not 0 < self.confidence < 1:
+            raise AvatarError(
+                "pictures: expected at least 0, resamples: at least 100, confidence: in (0, 1); "
+                f"got {self.pictures}, {self.resamples}, {self.confidence}."
+            )
+        find_metrics(self.metrics)
 
 
 def compare(config: CompareConfig) -> Path:
-    """Writes ``<out>/<table>.csv`` (tidy), ``<table>.frames.csv`` and ``<table>.md``; gives the Markdown's path.
+    """Writes ``<out>/<table>.*``; gives the path of the Markdown.
+
+    ``.csv`` and ``.frames.csv`` hold the tidy scores, ``.md`` and ``.tex`` the tables, ``.differences.csv`` those to
+    the baseline, ``.<plot>.png`` the plots, ``.poses.png`` the same unseen poses by all methods.
 
     Raises:
-        AvatarError: when nothing was scored.
+        AvatarError: when nothing was scored, or when outfits of one name in two data sets would share a row.
     """
-    scores = Scores()
-    for path in scored_files(config):
-        scores = scores + read_scores(path)
+    runs = config.runs or tuple(named_runs(config))
+    scores = gather_scores(config, runs)
+    write_scores(file_of(config, "csv"), scores)
+    scores, shared = without_shared_variant(scores)
+    tables = [*main_tables(config, scores.rows), *side_tables(config, scores)]
+    tables[0] = replace(tables[0], notes=(*tables[0].notes, *([f"All methods: {shared}."] if shared else [])))
+    if config.reported is not None:
+        tables.append(reported_table(config.reported))
+    tables += canonical_tables(config)
+    pictures = [*save_plots(config, scores.rows, runs)]
+    if config.pictures:
+        grid = file_of(config, "poses.png")
+        pictures += [grid] if draw_pose_grid(grid, runs, config.pictures, config.split, config.data_root) else []
+    text = "\n".join([*map(to_markdown, tables), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
+    write_whole(file_of(config, "md"), text.encode())
+    write_whole(file_of(config, "tex"), "\n".join(map(to_latex, tables)).encode())
+    print(text)
+    return file_of(config, "md")
+
+
+def file_of(config: CompareConfig, suffix: str) -> Path:
+    """One of the table's files."""
+    return config.out / f"{config.table}.{suffix}"
+
+
+def named_runs(config: CompareConfig) -> Iterator[Path]:
+    """The scored runs of the data sets, methods and name asked for."""
+    for dataset in config.dataset:
+        for method in config.methods:
+            found = sorted((config.runs_root / method / dataset).glob(f"*/{config.name}/scores.csv"))
+            yield from (path.parent for path in found)
+
+
+def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
+    """The scores of runs behind those of their outfits' floors.
+
+    Raises:
+        AvatarError: when there are none, or outfits of one name come from several data sets.
+    """
+    scores, homes = Scores(), {}
+    for run in runs:
+        mine = read_scores(run / "scores.csv")
+        for row in mine.rows:
+            homes.setdefault(row.outfit, set()).add(row.dataset or dataset_of(run))
+        scores = scores + mine
     if not scores.rows:
         raise AvatarError(f"runs_root: no scores below {config.runs_root}. Run tools/evaluate.py first.")
-    rows = [replace(row, table=config.table) for row in scores.rows]
-    write_scores(config.out / f"{config.table}.csv", Scores(rows, scores.frames))
-    views = [(metric, View.VALUE) for metric in config.metrics]
+    torn = [(outfit, sorted(found)) for outfit, found in homes.items() if len(found) > 1]
+    if torn:
+        raise AvatarError(
+            f"runs: outfit {torn[0][0]!r} is in several data sets ({', '.join(torn[0][1])}) and would share a row. "
+            "Compare one data set at a time."
+        )
+    floors = Scores()
+    for outfit, (dataset,) in sorted(homes.items()):
+        path = config.runs_root / "floors" / dataset / outfit / "scores.csv"
+        floors = floors + (read_scores(path) if path.is_file() else Scores())
+    whole = floors + scores
+    return Scores([replace(row, table=config.table) for row in whole.rows], whole.frames)
+
+
+def without_shared_variant(scores: Scores) -> tuple[Scores, str]:
+    """The scores without a variant that all trained methods share, and that variant: it tells nothing apart."""
+    variants = {row.variant for row in scores.rows if row.method not in FLOORS[:2]}
+    shared = variants.pop() if len(variants) == 1 else ""
+    rows = [replace(row, variant="") if row.variant == shared else row for row in scores.rows]
+    frames = [replace(row, variant="") if row.variant == shared else row for row in scores.frames]
+    return Scores(rows, frames), shared
+
+
+def dataset_of(run: Path) -> str:
+    """The data set that a run's settings name; that of older scores, which do not say."""
+    path = run / "config.yaml"
+    if not path.is_file():
+        raise DataError(run / "scores.csv", "these scores do not say their data set.", "Score them again.")
+    return str(yaml.safe_load(path.read_text())["dataset"])
+
+
+def main_tables(config: CompareConfig, rows: list[Score]) -> list[Table]:
+    """The table in the form asked for, or outfits by methods for each metric with the excess over the floors."""
+    metrics = [name for name in config.metrics if name in {row.metric for row in rows}]
+    if config.form is not None:
+        tables = [form_table(rows, metrics, config.form, config.table)]
+        distances = [name for name in metrics if name.startswith("cd_")]
+        if distances and any(row.method == "sampling" for row in rows):
+            title = f"{config.table}, excess over the sampling floor"
+            tables.append(form_table(rows, distances, config.form, title, excess=True))
+        return tables
+    tables = [outfit_table(rows, metric) for metric in metrics]
     methods = {row.method for row in rows}
-    if {"sampling", "body"} <= methods:
-        views += [("cd_point", View.EXCESS), ("cd_point", View.OF_BODY)]
-        views += [("cd_point", View.OF_STATIC)] if "static" in methods else []
-    text = "\n".join(to_markdown(outfit_table(rows, metric, view)) for metric, view in views)
-    path = config.out / f"{config.table}.md"
-    write_whole(path, text.encode())
-    print(text)
-    return path
+    if {"sampling", "body"} <= methods and "cd_point" in metrics:
+        tables += [outfit_table(rows, "cd_point", View.EXCESS), outfit_table(rows, "cd_point", View.OF_BODY)]
+        tables += [outfit_table(rows, "cd_point", View.OF_STATIC)] if "static" in methods else []
+    return tables
 
 
-def scored_files(config: CompareConfig) -> Iterator[Path]:
-    """The score files of the runs and of their outfits' floors."""
-    for dataset in config.dataset:
-        outfits: set[str] = set()
-        for method in config.methods:
-            for path in sorted((config.runs_root / method / dataset).glob(f"*/{config.name}/scores.csv")):
-                outfits |= set(path.parent.parent.name.split("+"))
-                yield path
-        for outfit in sorted(outfits):
-            path = config.runs_root / "floors" / dataset / outfit / "scores.csv"
-            if path.is_file():
-                yield path
+def side_tables(config: CompareConfig, scores: Scores) -> list[Table]:
+    """What training cost, and differences to the baseline, which are written as CSV too."""
+    tables = [budget_table(scores.rows)]
+    if config.baseline:
+        scored = {row.metric for row in scores.frames}
+        metrics = [name for name in config.metrics if name in scored]
+        found = [
+            difference
+            for metric in metrics
+            for difference in compare_methods(scores, metric, config.baseline, config.resamples, config.confidence)
+        ]
+        write_whole(file_of(config, "differences.csv"), differences_csv(found).encode())
+        tables += [difference_table(found, metric) for metric in metrics]
+    return tables
+
+
+def canonical_tables(config: CompareConfig) -> list[Table]:
+    """Canonical scans against their truth, a table an outfit and split."""
+    tables = []
+    for folder in config.canonicalizers:
+        rows = read_scores(folder / "scores.csv").rows
+        for split in dict.fromkeys(row.variant for row in rows if row.variant):
+            mine = [replace(row, variant="") for row in rows if row.variant in ("", split)]
+            table = canonical_table(mine, rows[0].outfit)
+            tables.append(replace(table, title=f"{table.title}: canonical scans of {split} frames"))
+    return tables
+
+
+def save_plots(config: CompareConfig, rows: list[Score], runs: tuple[Path, ...]) -> Iterator[Path]:
+    """Error by outfit, by share of the training frames where there are several, and against training time."""
+    metric = next((name for name in config.metrics if name in {row.metric for row in rows}), None)
+    if not config.plots or metric is None:
+        return
+    figures = {"outfits": plot_outfits(rows, metric), "times": plot_times(rows, metric)}
+    if len({row.fraction for row in rows if row.method not in FLOORS}) > 1:
+        figures["fractions"] = plot_fractions(rows, metric)
+    logs: dict[str, dict[str, Path]] = {}
+    for run in runs:
+        if (run / "metrics.csv").is_file():
+            first = read_scores(run / "scores.csv").rows[0]
+            logs.setdefault(run.parent.name, {})[method_key(first)] = run / "metrics.csv"
+    if logs:
+        figures["progress"] = plot_progress(logs)
+    for name, figure in figures.items():
+        save_figure(figure, file_of(config, f"{name}.png"))
+        yield file_of(config, f"{name}.png")

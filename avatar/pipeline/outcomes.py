@@ -6,9 +6,10 @@ import json
 import os
 import socket
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 from avatar.io.npz import write_whole
 
@@ -26,7 +27,10 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """One job: ``number`` in the multirun, its command line, how far it got, and why no further."""
+    """One job: ``number`` in the multirun, its command line, how far it got, and why no further.
+
+    ``settings`` are those of a finished job, as plain values.
+    """
 
     number: int
     job: str
@@ -34,11 +38,14 @@ class Outcome:
     why: str = ""
     process: int = 0
     machine: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
 
 
-def note_outcome(folder: Path, number: int, job: str, state: State, why: str = "") -> None:
+def note_outcome(
+    folder: Path, number: int, job: str, state: State, why: str = "", settings: dict[str, Any] | None = None
+) -> None:
     """Writes down how far a job got; any process on any machine that sees the folder may do so."""
-    outcome = Outcome(number, job, state.value, why, os.getpid(), socket.gethostname())
+    outcome = Outcome(number, job, state.value, why, os.getpid(), socket.gethostname(), settings or {})
     write_whole(folder / f"job-{number:04d}.json", json.dumps(asdict(outcome), indent=1).encode())
 
 

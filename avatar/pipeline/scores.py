@@ -130,16 +130,19 @@ def score_runs(config: EvaluateConfig) -> Scores:
         settings = avatar.config
         label = Label(
             settings.method.variant,
+            variant=variant_of(settings),
             seed=settings.train.seed,
             steps=avatar.steps,
             seconds=avatar.seconds,
             commit=current_commit(),
+            fraction=settings.split.train_fraction,
         )
         mine = Scores()
         for outfit in run_outfits(avatar, config.data_root):
             folder = predictions_folder(run, config.split, outfit.name)
+            meshes = meshes_folder(run, config.split, outfit.name) if is_implicit(avatar) else None
             done = Ledger(run / "predictions")
-            mine = mine + score_predictions(folder, outfit, config.split, config.score, label, None, done)
+            mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes, done)
             if config.floors and outfit.path not in seen:
                 seen.add(outfit.path)
                 path = floors_root(run, settings) / "floors" / settings.dataset / outfit.name / "scores.csv"
@@ -147,6 +150,16 @@ def score_runs(config: EvaluateConfig) -> Scores:
         write_scores(run / "scores.csv", mine)
         scores = scores + mine
     return scores
+
+
+def variant_of(config: RunConfig) -> str:
+    """What tells a run from its method's usual one: outfits it shares a network with, less data, a canonicalizer."""
+    parts = [f"{len(config.outfit)} outfits"] if len(config.outfit) > 1 else []
+    if config.split.train_fraction < 1:
+        parts.append(f"{100 * config.split.train_fraction:g}%")
+    if config.canonical != "default":
+        parts.append(config.canonical)
+    return ", ".join(parts)
 
 
 def floors_root(run: Path, settings: RunConfig) -> Path:

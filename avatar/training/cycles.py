@@ -79,7 +79,7 @@ class CycleTrainer:
         self.device = next(model.parameters()).device
         self.model, self.template, self.config, self.folder = model, template.to(self.device), config, folder
         self.scans, self.names, self.weights = scans, names, template.weights
-        self.optimiser = torch.optim.Adam(model.parameters(), lr=config.first_lr)
+        self.optimiser = torch.optim.Adam(model.parameters(), lr=config.first_lr, fused=True)
         self.step, self.seconds, self.bad_steps = 0, 0.0, 0
 
     def fit(self) -> None:

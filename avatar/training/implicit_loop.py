@@ -69,7 +69,7 @@ class ImplicitTrainer:
         self.device = model.box.device
         self.body = body.to(self.device)
         self.learned = [parameter for parameter in model.parameters() if parameter.requires_grad]
-        self.optimiser = torch.optim.Adam(self.learned, lr=config.lr)
+        self.optimiser = torch.optim.Adam(self.learned, lr=config.lr, fused=True)
         self.step, self.seconds, self.bad_steps = 0, 0.0, 0
 
     def fit(self, frames: CanonicalFrames, held_back: CanonicalFrames | None) -> None:

@@ -23,8 +23,10 @@ report = logging.getLogger(__name__)
 
 
 @contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path, wait: bool = False) -> Iterator[None]:
     """Holds a run's folder for the length of a ``with`` block; the thread that holds it may enter again.
+
+    With ``wait`` a folder that another job holds is waited for, instead of refused.
 
     The operating system keeps the lock with the open file and lets go of it when the process ends, by ``kill -9``
     too, so there are no stale locks. The file says who holds it, for the message alone.
@@ -38,7 +40,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
         yield
         return
     with _open_lock(place) as file:
-        _take(file, place)
+        _take(file, place, wait)
         HELD[place] = threading.get_ident()
         try:
             yield
@@ -55,10 +57,10 @@ def _open_lock(folder: Path) -> BinaryIO:
         raise DataError(folder / LOCK, f"could not be opened for writing ({error.strerror}).") from error
 
 
-def _take(file: BinaryIO, folder: Path) -> None:
+def _take(file: BinaryIO, folder: Path, wait: bool) -> None:
     """Locks an open file, or refuses, and writes down who holds it."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
         raise AvatarError(
             f"{folder}: another job is at work here ({_holder(file)}). "

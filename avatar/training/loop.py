@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from avatar.checks import AvatarError
+from avatar.environment import keep_freed_memory
 from avatar.nn.methods import draw_samples
 from avatar.records import Batch, LossTerms, SurfaceSamples
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
@@ -101,7 +102,7 @@ class Trainer:
         codes = [parameter for name, parameter in model.named_parameters() if name == "codes"]
         others = [parameter for name, parameter in model.named_parameters() if name != "codes"]
         groups = [{"params": others, "lr": config.lr}, {"params": codes, "lr": config.code_lr}]
-        self.optimiser = torch.optim.Adam(groups)
+        self.optimiser = torch.optim.Adam(groups, fused=True)
         self.base_rates = [config.lr, config.code_lr]
         self.step, self.seconds, self.bad_steps = 0, 0.0, 0
 
@@ -120,6 +121,8 @@ class Trainer:
             AvatarError: when losses or gradients stay non-finite, or another job holds the folder.
             Stopped: after SIGTERM or SIGUSR1, with everything saved.
         """
+        if self.device.type == "cpu":
+            keep_freed_memory()
         with lock_folder(self.folder) if self.team.leads else nullcontext(), stop_requests() as stop:
             self.resume()
             columns = ["loss", "chamfer", *TERMS, "lr", "grad_norm"]

@@ -9,16 +9,21 @@ import subprocess
 import sys
 import tracemalloc
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.sparse
+import torch
 from bodies import random_model
 
 from avatar.body.convert import convert_body_model
-from avatar.body.smpl import joint_tree
+from avatar.body.open import open_body
+from avatar.body.packed import packed_body, write_template
+from avatar.body.smpl import joint_tree, smpl_body
 from avatar.checks import AvatarError, DataError
+from avatar.nn.baselines.atlas import Atlas
 
 PROTOCOLS = range(6)
 
@@ -322,3 +327,111 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert "smplh body" in capsys.readouterr().out
     with pytest.raises(SystemExit, match=r"none\.npz"):
         run(tmp_path / "none.npz", tmp_path / "plain.npz")
+
+
+def unwrapped(model: dict, places: np.ndarray) -> dict:
+    """SMPL-X's own atlas: every corner of every triangle has a place of its own."""
+    return model | {"vt": places, "ft": np.arange(model["f"].size).reshape(-1, 3)}
+
+
+@pytest.fixture
+def places() -> np.ndarray:
+    return np.random.default_rng(3).random((90, 2))
+
+
+def distinct(model: dict) -> dict:
+    """A model whose triangles are 30 different ones of three different vertices."""
+    faces = np.random.default_rng(4).permuted(np.tile(np.arange(40), (30, 1)), axis=1)[:, :3]
+    return model | {"f": faces.astype(np.uint32)}
+
+
+def write_unwrapped(path: Path, model: dict, places: np.ndarray) -> Path:
+    lines = ["v 0 0 0"] * len(model["v_template"]) + [f"vt {u:.9f} {v:.9f}" for u, v in places]
+    for number, face in enumerate(model["f"]):
+        lines.append("f " + " ".join(f"{vertex + 1}/{3 * number + corner + 1}" for corner, vertex in enumerate(face)))
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".pkl"])
+@pytest.mark.parametrize("kind", [np.uint32, np.float64])
+def test_smplx_files_bring_their_own_atlas(suffix, kind, places, tmp_path):
+    model, source = unwrapped(vars(random_model("smplx")), places), tmp_path / f"model{suffix}"
+    model["ft"] = model["ft"].astype(kind)
+    if suffix == ".npz":
+        np.savez(source, **model)
+    else:
+        source.write_bytes(pickle.dumps(model))
+    convert_body_model(source, tmp_path / "plain.npz")
+    body = smpl_body(tmp_path / "plain.npz")
+    assert body.template.uv.numpy()[body.template.uv_faces].shape == (30, 3, 2)
+    np.testing.assert_array_equal(body.template.uv.numpy(), places.astype(np.float32))
+    assert smpl_body(tmp_path / "plain.npz", canonical_pose=torch.ones(22, 3)).template.uv_faces is not None
+
+
+def test_smpl_files_take_an_atlas_from_an_obj_of_their_mesh(places, tmp_path):
+    model = distinct(vars(random_model("smpl")))
+    (tmp_path / "model.pkl").write_bytes(pickle.dumps(model))
+    obj = write_unwrapped(tmp_path / "uv.obj", model, places)
+    assert convert_body_model(tmp_path / "model.pkl", tmp_path / "plain.npz", obj) == "smpl"
+    template = smpl_body(tmp_path / "plain.npz").template
+    np.testing.assert_allclose(template.uv[template.uv_faces].numpy(), places.reshape(30, 3, 2), atol=1e-6)
+    convert_body_model(tmp_path / "model.pkl", tmp_path / "bare.npz")
+    assert smpl_body(tmp_path / "bare.npz").template.uv is None
+
+
+def test_a_given_obj_comes_before_the_files_own_atlas(places, tmp_path):
+    model = distinct(vars(random_model("smplx")))
+    np.savez(tmp_path / "model.npz", **unwrapped(model, places))
+    obj = write_unwrapped(tmp_path / "uv.obj", model, 1 - places)
+    convert_body_model(tmp_path / "model.npz", tmp_path / "plain.npz", obj)
+    template = smpl_body(tmp_path / "plain.npz").template
+    np.testing.assert_allclose(template.uv[template.uv_faces].numpy(), 1 - places.reshape(30, 3, 2), atol=1e-6)
+
+
+def test_any_template_of_ours_takes_an_atlas_from_an_obj_through_the_command(tmp_path, monkeypatch, capsys):
+    body = open_body("female").template
+    bare = replace(body, uv=None, uv_faces=None)
+    write_template(tmp_path / "template.npz", bare)
+    lines = [f"v {x} {y} {z}" for x, y, z in body.vertices.tolist()] + [f"vt {u:.9f} {v:.9f}" for u, v in body.uv]
+    for face, corners in zip(body.faces.tolist(), body.uv_faces.tolist()):
+        lines.append("f " + " ".join(f"{v + 1}/{c + 1}" for v, c in zip(face, corners)))
+    (tmp_path / "body.obj").write_text("\n".join(lines))
+    command = ["convert_body.py", "template.npz", "with_uv.npz", "--uv", "body.obj"]
+    monkeypatch.setattr(sys, "argv", command)
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(Path(__file__).parents[2] / "tools" / "convert_body.py"), run_name="__main__")
+    assert "packed body" in capsys.readouterr().out
+    found = packed_body(tmp_path / "with_uv.npz").template
+    torch.testing.assert_close(found.uv[found.uv_faces], body.uv[body.uv_faces])
+    torch.testing.assert_close(found.vertices, body.vertices)
+    samples = Atlas(found, 64).pixel_points(2000)
+    torch.testing.assert_close(samples.vertex_ids, Atlas(body, 64).pixel_points(2000).vertex_ids)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"ft": np.full((30, 3), 90)}, r"uv_faces: expected indices in \[0, 90\)"),
+        ({"ft": np.arange(87).reshape(29, 3)}, "ft"),
+        ({"ft": np.full((30, 3), 0.5)}, "ft: expected whole numbers"),
+        ({"vt": np.full((90, 3), 0.5)}, "vt"),
+    ],
+)
+def test_atlases_that_do_not_fit_their_model_are_refused(change, message, places, tmp_path):
+    np.savez(tmp_path / "model.npz", **unwrapped(vars(random_model("smplx")), places) | change)
+    with pytest.raises(DataError, match=rf"model\.npz.*{message}"):
+        convert_body_model(tmp_path / "model.npz", tmp_path / "plain.npz")
+    assert not (tmp_path / "plain.npz").is_file()
+
+
+def test_an_obj_that_is_not_the_models_is_refused_with_the_mend(places, tmp_path):
+    model = distinct(vars(random_model("smpl")))
+    np.savez(tmp_path / "model.npz", **model)
+    obj = write_unwrapped(tmp_path / "uv.obj", model | {"v_template": np.zeros((41, 3))}, places)
+    with pytest.raises(DataError, match=r"uv\.obj.*40 vertices, got 41.*UV template of this body model"):
+        convert_body_model(tmp_path / "model.npz", tmp_path / "plain.npz", obj)
+    (tmp_path / "bare.obj").write_text("v 0 0 0\n" * 40 + "f 1 2 3\n")
+    with pytest.raises(DataError, match=r"bare\.obj.*no texture coordinates.*vt"):
+        convert_body_model(tmp_path / "model.npz", tmp_path / "plain.npz", tmp_path / "bare.obj")
+    assert not (tmp_path / "plain.npz").is_file()

@@ -228,6 +228,20 @@ def test_pop_files_with_a_mesh_template_are_read_as_they_are(packed):
         _ = PackedOutfit(folder).template
 
 
+def test_a_mesh_template_brings_its_uv_atlas_where_it_is_unwrapped(packed):
+    folder, _ = packed
+    body = open_body("female").template
+    (folder / "template.npz").unlink()
+    lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in body.vertices.tolist()]
+    lines += [f"vt {u:.9f} {v:.9f}" for u, v in body.uv.tolist()]
+    for face, corners in zip(body.faces.tolist(), body.uv_faces.tolist()):
+        lines.append("f " + " ".join(f"{v + 1}/{c + 1}" for v, c in zip(face, corners)))
+    (folder / "template.obj").write_text("\n".join(lines))
+    template = PackedOutfit(folder).template
+    torch.testing.assert_close(template.uv[template.uv_faces], body.uv[body.uv_faces])
+    torch.testing.assert_close(template.faces, body.faces)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

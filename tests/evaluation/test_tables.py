@@ -7,7 +7,7 @@ import pytest
 from avatar.checks import AvatarError
 from avatar.evaluation.metrics import METRICS
 from avatar.evaluation.scores import Score
-from avatar.evaluation.tables import View, metric_table, outfit_table, to_csv, to_latex, to_markdown
+from avatar.evaluation.tables import Table, TableRow, View, metric_table, outfit_table, to_csv, to_latex, to_markdown
 
 VALUES = {
     "dress": {"sampling": 1e-4, "body": 21e-4, "static": 6e-4, "closet": 5e-4},
@@ -109,3 +109,17 @@ def test_latex_is_escaped_and_complete():
     assert "long\\_shirt & 1.000 & 5.000 & 3.000 & 2.000 \\\\" in text
     assert text.count("\\midrule") == 2 and "\\end{table}" in text
     assert "m\\textsuperscript{2}" in text and text.isascii()
+
+
+def test_grouped_columns_have_one_heading_in_latex_and_full_names_elsewhere():
+    rows = (TableRow("pop", (1.0, 2.0, 3.0)),)
+    table = Table("t", "method", ("mean", "max", "mean"), rows, (), ("CD_1", "CD_1", "NML"))
+    assert "| method | CD_1, mean | CD_1, max | NML, mean |" in to_markdown(table)
+    assert to_csv(table).startswith('method,"CD_1, mean","CD_1, max","NML, mean"')
+    lines = to_latex(table).splitlines()
+    start = lines.index("\\toprule")
+    assert lines[start + 1 : start + 4] == [
+        "& \\multicolumn{2}{c}{CD\\_1} & \\multicolumn{1}{c}{NML} \\\\",
+        "\\cmidrule(lr){2-3} \\cmidrule(lr){4-4}",
+        "method & mean & max & mean \\\\",
+    ]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reference import ball_loop, nearest_loop
 
 from avatar.checks import AvatarError
-from avatar.geometry.neighbours import _k_nearest_chunked, ball_query, k_nearest, nearest
+from avatar.geometry.neighbours import _k_nearest_chunked, ball_query, k_nearest, nearest, nearest_both_ways
 
 
 def cloud(batch: int, count: int, seed: int) -> torch.Tensor:
@@ -26,6 +26,16 @@ def test_k_nearest_agrees_with_loop(queries, points, seed):
     assert found.shape == (2, queries, k) and found.dtype == torch.long
     for b in range(2):
         np.testing.assert_array_equal(found[b].numpy(), nearest_loop(q[b].double().numpy(), p[b].double().numpy(), k))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 200), st.integers(1, 200), st.integers(0, 1000))
+def test_both_ways_agree_with_loop(points, others, seed):
+    p, q = cloud(2, points, seed), cloud(2, others, seed + 1)
+    there, back = nearest_both_ways(p, q)
+    for b, (first, second) in enumerate(zip(p.double().numpy(), q.double().numpy())):
+        np.testing.assert_array_equal(there[b, :, None].numpy(), nearest_loop(first, second, 1))
+        np.testing.assert_array_equal(back[b, :, None].numpy(), nearest_loop(second, first, 1))
 
 
 def test_chunked_search_of_cuda_agrees_with_the_tree(monkeypatch):
@@ -72,6 +82,8 @@ def test_non_finite_coordinates_are_refused(bad, where):
     (q if where == "queries" else p)[0, 2, 1] = bad
     with pytest.raises(AvatarError, match="finite"):
         nearest(q, p)
+    with pytest.raises(AvatarError, match="finite"):
+        nearest_both_ways(q, p)
 
 
 def test_chunked_search_carries_nan_through_with_indices_in_range():

@@ -52,14 +52,26 @@ def test_set_abstraction_equals_the_layer_applied_to_every_neighbour():
     torch.testing.assert_close(layer(features), torch.stack(slow, dim=1))
 
 
-def test_feature_propagation_returns_coarse_values_at_coarse_points():
+def test_groups_are_rows_of_the_finer_level():
+    level = build_levels(sphere_template().vertices, SIZES)[0]
+    values = torch.randn(2, 162, 5)
+    assert torch.equal(level.group(values), values[:, level.groups])
+
+
+def test_feature_propagation_equals_the_layers_on_interpolated_and_own_features():
+    torch.manual_seed(0)
     level = build_levels(sphere_template().vertices.double(), SIZES)[0]
-    layer = FeaturePropagation(level, 4, 2, (4,))
-    layer.mlp = torch.nn.Identity()
+    layer = FeaturePropagation(level, 4, 2, (6, 5)).double()
+    coarse, fine = torch.randn(2, 40, 4).double(), torch.randn(2, 162, 2).double()
+    spread = (coarse[:, level.up_ids] * level.up_weights[..., None]).sum(dim=2)
+    torch.testing.assert_close(layer(coarse, fine), layer.mlp(torch.cat([spread, fine], dim=-1)))
+
+
+def test_interpolation_returns_coarse_values_at_coarse_points():
+    level = build_levels(sphere_template().vertices.double(), SIZES)[0]
     coarse = torch.randn(1, 40, 4, dtype=torch.float64)
-    spread = layer(coarse, torch.zeros(1, 162, 2, dtype=torch.float64))
     shared = (level.finer_positions[:, None] - level.positions[None]).norm(dim=-1).min(dim=0).indices
-    torch.testing.assert_close(spread[:, shared, :4], coarse, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(level.spread(coarse)[:, shared], coarse, rtol=1e-5, atol=1e-5)
 
 
 def test_encoder_treats_frames_independently_and_sees_far_parts():

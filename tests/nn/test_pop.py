@@ -171,6 +171,8 @@ def test_explicit_template_is_one_for_all_poses():
     alone = model(batch, samples, wrinkles=False)
     torch.testing.assert_close(alone.offsets, prediction.garment_offsets)
     assert alone.wrinkle_offsets is None and alone.wrinkle_normals is None
+    plain = avatar()(batch, samples)
+    assert plain.wrinkle_offsets is plain.wrinkle_normals is None  # weights of wrinkles are not for the whole offset
     turned = interpolate(batch.vertex_transforms[..., :3, :3].flatten(-2), samples).unflatten(-1, (3, 3))
     added = (turned.inverse() @ prediction.normals[..., None])[..., 0]
     garment = (turned.inverse() @ alone.normals[..., None])[..., 0]

@@ -26,7 +26,8 @@ class Atlas(nn.Module):
         if template.uv is None or template.uv_faces is None:
             raise AvatarError(
                 "template: expected a body with UV coordinates, as methods of the UV plane need, got one without. "
-                "The open body and anny's have them; put `uv` and `uv_faces` into any other's template.npz."
+                "The open body, anny's and SMPL-X's have them; for any other: "
+                "python tools/convert_body.py <body file> <new file> --uv <OBJ of its mesh, with texture coordinates>."
             )
         grid = rasterise_uv(template.uv, template.uv_faces, template.faces, map_size)
         self.map_size = map_size

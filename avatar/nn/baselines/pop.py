@@ -100,7 +100,7 @@ class PopAvatar(nn.Module):
             wrinkles: False leaves the pose out, for a network with an explicit template.
 
         Returns:
-            `Prediction` with ``x = T r + p``; r is all wrinkle without an explicit template.
+            `Prediction` with ``x = T r + p``; its parts are named with an explicit template alone.
         """
         check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=len(self.vertices))
         if not (wrinkles or self.config.template):
@@ -126,7 +126,7 @@ class PopAvatar(nn.Module):
             normals=normals,
             offsets=local.offsets,
             garment_offsets=parts[0].offsets if self.config.template else None,
-            wrinkle_offsets=parts[-1].offsets if wrinkles else None,
+            wrinkle_offsets=parts[-1].offsets if wrinkles and self.config.template else None,
             wrinkle_normals=parts[-1].normals if wrinkles and self.config.template else None,
             codes=codes,
         )

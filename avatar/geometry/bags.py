@@ -1,0 +1,85 @@
+"""Weighted sums of a few rows each: what gathers from a mesh or a hierarchy, and its transpose, which scatters back.
+
+Autograd's own backward pass of a gather adds row by row and is slow on the CPU; the transpose of a constant table is
+a table again, so both directions are the same fast sum, and no order of additions depends on threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+from avatar.checks import check_shape
+
+
+@dataclass(frozen=True)
+class Bags:
+    """A sparse linear map on rows: result ``i`` adds up ``weights[j] * values[ids[j]]`` for j from ``starts[i]`` on.
+
+    ``ids (L,)`` int64, ``starts (R,)`` int64, one bag after the other, ``weights (L,)`` or None where all are one;
+    ``rows`` is the number of rows of the values.
+    """
+
+    ids: Tensor
+    starts: Tensor
+    weights: Tensor | None
+    rows: int
+
+    @classmethod
+    def of_table(cls, ids: Tensor, rows: int, weights: Tensor | None = None) -> Bags:
+        """Bags of one size: ``ids (R, K)`` and weights alike."""
+        dims = check_shape("ids", ids, "R K")
+        if weights is not None:
+            check_shape("weights", weights, "R K", **dims)
+            weights = weights.flatten()
+        starts = torch.arange(0, ids.numel(), dims["K"], device=ids.device)
+        return cls(ids.flatten(), starts, weights, rows)
+
+    def transpose(self) -> Bags:
+        """The transposed map: it takes a row for every bag and has a bag for every row."""
+        order = self.ids.argsort(stable=True)
+        places = torch.arange(self.rows, device=order.device)
+        members = torch.searchsorted(self.starts, order, right=True) - 1
+        weights = None if self.weights is None else self.weights[order]
+        return Bags(members, torch.searchsorted(self.ids[order], places), weights, len(self.starts))
+
+
+class _SumBags(torch.autograd.Function):
+    """The sum with its transpose as backward pass; differentiable as often as one likes."""
+
+    @staticmethod
+    def forward(context: Any, values: Tensor, bags: Bags, back: Bags | None) -> Tensor:
+        context.bags, context.back = bags, back
+        frames, rows, channels = values.shape
+        each = torch.arange(frames, device=values.device)[:, None]
+        weights = None if bags.weights is None else bags.weights.to(values.dtype).repeat(frames)
+        summed = embedding_bag(
+            (bags.ids + each * rows).flatten(),
+            values.reshape(-1, channels),
+            (bags.starts + each * len(bags.ids)).flatten(),
+            mode="sum",
+            per_sample_weights=weights,
+        )
+        return summed.view(frames, len(bags.starts), channels)
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        back = context.back or context.bags.transpose()
+        return _SumBags.apply(gradient, back, context.bags), None, None
+
+
+def sum_bags(values: Tensor, bags: Bags, back: Bags | None = None) -> Tensor:
+    """Sums of bags of rows, ``(..., V, C)`` to ``(..., R, C)``; differentiable in the values.
+
+    Args:
+        values: any number of arrays of rows.
+        bags: which rows, with which weights.
+        back: ``bags.transpose()``, where it is at hand; else the backward pass makes it.
+    """
+    check_shape("values", values, "... V C", V=bags.rows)
+    summed = _SumBags.apply(values.reshape(-1, *values.shape[-2:]), bags, back)
+    return summed.view(*values.shape[:-2], *summed.shape[-2:])

@@ -1,0 +1,128 @@
+"""UV atlases of meshes that are already known, from the texture coordinates of an OBJ file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from avatar.checks import DataError
+
+MAX_BYTES = 256 << 20
+ROUNDING = 1e-5  # how far out of [0, 1] a coordinate may be written and still mean the border
+
+
+@dataclass(frozen=True)
+class MeshAtlas:
+    """A mesh's UV coordinates: ``uv (U, 2)`` float32 in [0, 1], ``uv_faces (F, 3)`` int64 index of each corner's."""
+
+    uv: np.ndarray
+    uv_faces: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Corner:
+    """A corner of a polygon: its vertex, and its place in the atlas or None."""
+
+    vertex: int
+    place: int | None
+
+
+def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAtlas | None:
+    """The UV atlas that an OBJ file has for a mesh of the same vertices, in any pose.
+
+    Its triangles or quads may stand in another order than the mesh's; a triangle of the mesh takes the coordinates of
+    the polygon that has its three vertices.
+
+    Args:
+        path: the OBJ file.
+        faces: ``(F, 3)`` of the mesh.
+        vertices: how many the mesh has.
+
+    Returns:
+        The atlas, or None for a file without texture coordinates.
+
+    Raises:
+        DataError: naming the file and what is wrong: missing, no OBJ, another mesh, polygons without coordinates,
+            coordinates out of [0, 1].
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(path, "there is no such file.")
+    if path.stat().st_size > MAX_BYTES:
+        raise DataError(path, f"expected an OBJ of at most {MAX_BYTES} bytes, got {path.stat().st_size}.")
+    count, places, polygons = 0, [], []
+    try:
+        for key, words in _lines(path):
+            if key == "v":
+                count += 1
+            elif key == "vt":
+                places.append([float(word) for word in words[:2]])
+            elif key == "f":
+                polygons.append([_corner(word, count, len(places)) for word in words])
+        uv = np.array(places, np.float32).reshape(-1, 2)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DataError(path, f"cannot be read as OBJ ({error}).") from error
+    if count != vertices:
+        mend = "Take the UV template of this body model, with all its vertices in their order."
+        raise DataError(path, f"expected the body's {vertices} vertices, got {count}: it is of another mesh.", mend)
+    if not len(uv):
+        return None
+    low, high = float(uv.min()), float(uv.max())
+    if not (low >= -ROUNDING and high <= 1 + ROUNDING):  # not so for NaN either
+        mend = "Pack the islands into one tile before exporting."
+        raise DataError(path, f"expected texture coordinates in [0, 1], got {low:.3g} to {high:.3g}.", mend)
+    return MeshAtlas(np.clip(uv, 0, 1), _match(path, polygons, faces))
+
+
+def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Key and words of the lines of an OBJ file, those ending in a backslash joined with the next."""
+    with path.open(encoding="utf-8") as file:
+        kept = ""
+        for line in file:
+            line = kept + line.partition("#")[0].strip()
+            kept = line[:-1] + " " if line.endswith("\\") else ""
+            words = [] if kept else line.split()
+            if words:
+                yield words[0], words[1:]
+
+
+def _corner(word: str, vertices: int, places: int) -> _Corner:
+    """A corner such as ``12/7/3`` or ``12``; negative numbers count from the last one so far.
+
+    Raises:
+        ValueError: for what is no corner, or points to nothing.
+    """
+    numbers = [int(number) if number else 0 for number in word.split("/")[:2]]
+    found = []
+    for number, count in zip(numbers, (vertices, places)):
+        index = number - 1 if number > 0 else count + number
+        if number and not 0 <= index < count:
+            raise ValueError(f"corner {word} points to number {number} of {count}")
+        found.append(index if number else None)
+    if found[0] is None:
+        raise ValueError(f"corner {word} has no vertex")
+    return _Corner(found[0], found[1] if len(found) > 1 else None)
+
+
+def _match(path: Path, polygons: list[list[_Corner]], faces: np.ndarray) -> np.ndarray:
+    """The place in the atlas of each corner ``(F, 3)`` of a mesh's triangles."""
+    known = {}
+    for polygon in polygons:
+        if len(polygon) > 4:
+            raise DataError(path, f"expected triangles and quads, got a polygon of {len(polygon)} corners.")
+        for corners in combinations(polygon, 3):
+            known[frozenset(corner.vertex for corner in corners)] = {c.vertex: c.place for c in corners}
+    nothing = dict.fromkeys(np.unique(faces).tolist())
+    found = [[known.get(frozenset(face), nothing)[vertex] for vertex in face] for face in faces.tolist()]
+    bare = [number for number, places in enumerate(found) if None in places]
+    if bare:
+        mend = "Unwrap the whole body, and export the triangles or quads of its model as they are."
+        problem = (
+            f"{len(bare)} of the body's {len(faces)} triangles have no texture coordinates, the first is {bare[0]}"
+        )
+        raise DataError(path, f"{problem} (vertices {', '.join(map(str, faces[bare[0]]))}).", mend)
+    return np.array(found, np.int64)

@@ -1,0 +1,96 @@
+"""How many parameters each method's network has, part by part, beside what is known of the original."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from avatar.evaluation.tables import Table, TableRow, to_markdown
+from avatar.implicit.avatar import ImplicitAvatar
+from avatar.implicit.body_field import BodyField
+from avatar.io.npz import write_whole
+from avatar.nn.methods import build_avatar
+from avatar.pipeline.methods import find_settings
+from avatar.records import Template
+from avatar.settings import settings_from_dict
+from avatar.training.implicit_runs import METHOD as SCANIMATE
+from avatar.training.runs import MethodChoice
+
+CODES, TOTAL = "codes of an outfit", "total without codes"
+ORIGINAL = {  # counted in POP's own network at full size, codes apart
+    ("pop", "pose encoder"): 10_348_192,
+    ("pop", "garment encoder"): 307_200,
+    ("pop", "pose decoder"): 600_326,
+    ("pop", TOTAL): 11_255_718,
+    ("pop", CODES): 1_048_576,
+}
+
+
+@dataclass(frozen=True)
+class Count:
+    """The parameters of one part of a method's network at one size; ``original`` those of the authors', if known."""
+
+    method: str
+    size: str
+    part: str
+    parameters: int
+    original: int | None
+
+
+def build_network(choice: MethodChoice, template: Template) -> nn.Module:
+    """A method's untrained network for one outfit; learned skinning fields, which runs bring along, are left out."""
+    settings = settings_from_dict(find_settings(choice.name), choice.settings)
+    if choice.name == SCANIMATE:
+        box = torch.stack([template.vertices.amin(dim=0), template.vertices.amax(dim=0)])
+        return ImplicitAvatar(template, BodyField(template), box, settings.avatar)
+    return build_avatar(choice.name, template, 1, settings)
+
+
+def count_parameters(method: str, size: str, model: nn.Module) -> list[Count]:
+    """A network's parts with parameters, their total, and the garment codes that come with every outfit."""
+    parts = {name.replace("_", " "): sum(p.numel() for p in part.parameters()) for name, part in model.named_children()}
+    codes = sum(p.numel() for name, p in model.named_parameters() if name == "codes")
+    parts[TOTAL] = sum(p.numel() for p in model.parameters()) - codes
+    parts[CODES] = codes
+    known = {part: ORIGINAL.get((method, part)) if size == "full" else None for part in parts}
+    return [Count(method, size, part, count, known[part]) for part, count in parts.items() if count]
+
+
+def write_parameters(folder: Path, choices: Mapping[tuple[str, str], MethodChoice], template: Template) -> str:
+    """Writes ``parameters.csv`` and ``parameters.md`` for networks by method and size; gives the latter's text."""
+    counts = [
+        count
+        for (method, size), choice in choices.items()
+        for count in count_parameters(method, size, build_network(choice, template))
+    ]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("method", "size", "part", "parameters", "original"))
+    writer.writerows((c.method, c.size, c.part, c.parameters, c.original or "") for c in counts)
+    write_whole(folder / "parameters.csv", text.getvalue().encode())
+    markdown = "\n".join(to_markdown(parameter_table(counts, size)) for size in dict.fromkeys(c.size for c in counts))
+    write_whole(folder / "parameters.md", markdown.encode())
+    return markdown
+
+
+def parameter_table(counts: list[Count], size: str) -> Table:
+    """Methods by parts at one size, with the originals below the methods they are of."""
+    mine = [count for count in counts if count.size == size]
+    parts = list(dict.fromkeys(c.part for c in mine if c.part not in (TOTAL, CODES))) + [TOTAL, CODES]
+    body = []
+    for method in dict.fromkeys(count.method for count in mine):
+        found = {count.part: count for count in mine if count.method == method}
+        lines = [(method, {part: count.parameters for part, count in found.items()})]
+        originals = {part: count.original for part, count in found.items() if count.original}
+        lines += [(f"{method}, original", originals)] if originals else []
+        for label, values in lines:
+            texts = tuple(f"{values[part]:,}" if part in values else "–" for part in parts)
+            body.append(TableRow(label, tuple(values.get(part) for part in parts), texts=texts))
+    notes = ("One outfit on the open body. Skinning fields of canonicalizers are not counted.",)
+    return Table(f"parameters, size={size}", "method", tuple(parts), tuple(body), notes)

@@ -1,0 +1,89 @@
+"""`seams`: how runs predict near the cuts of the body's UV atlas, where POP's features jump and a surface's do not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from avatar.checks import AvatarError, check_name
+from avatar.data.outfits import Outfit
+from avatar.evaluation.scoring import Label
+from avatar.evaluation.seam_tables import SeamTest, seam_differences, seam_table, to_csv
+from avatar.evaluation.seams import measure_seams, seam_places
+from avatar.evaluation.tables import Table, to_markdown
+from avatar.io.npz import write_whole
+from avatar.pipeline.methods import is_implicit, load_avatar
+from avatar.pipeline.scores import current_commit, run_outfits, variant_of
+from avatar.pipeline.surfaces import spaced_frames
+from avatar.training.prediction import body_batch, outfit_index, predict
+from avatar.training.runs import TrainedAvatar
+
+
+@dataclass
+class SeamsConfig:
+    """The seam test of some runs; point methods only, for what is asked is at chosen places of the body."""
+
+    runs: tuple[Path, ...] = ()
+    table: str = "seams"  # the name of the table's files
+    baseline: str = ""  # the run, as the table names it, that others are set against; empty for none
+    split: str = "test"
+    points: int = 20000  # places on the body, the same for all runs of an outfit
+    frames: int | None = None  # this many of the split, evenly spaced; all of them if null
+    seed: int = 0
+    data_root: Path | None = None  # where the data are now; where they were at training if null
+    out: Path = Path("docs/results")
+
+    def __post_init__(self):
+        check_name("table", self.table)
+        if self.points < 1 or (self.frames is not None and self.frames < 1):
+            raise AvatarError(f"points, frames: expected at least 1, got {self.points} and {self.frames}.")
+
+
+def seams(config: SeamsConfig) -> Path:
+    """Writes ``<out>/<table>.csv`` and ``<table>.md``, which it prints; gives the path of the latter.
+
+    Raises:
+        AvatarError: without runs, for implicit ones, and for bodies without UV coordinates.
+    """
+    if not config.runs:
+        raise AvatarError("runs: expected the folders of trained runs, got none.")
+    tests: dict[tuple[str, str], list[SeamTest]] = {}
+    for run in config.runs:
+        avatar = load_avatar(run)
+        if is_implicit(avatar):
+            raise AvatarError(f"{run}: an implicit avatar has no points at chosen places of the body. Leave it out.")
+        for outfit in run_outfits(avatar, config.data_root):
+            tests.setdefault((outfit.dataset, outfit.name), []).append(probe_seams(config, avatar, outfit))
+    every = [test for mine in tests.values() for test in mine]
+    write_whole(config.out / f"{config.table}.csv", to_csv(every).encode())
+    tables: list[Table] = []
+    for mine in tests.values():
+        tables.append(seam_table(mine))
+        tables += [seam_differences(mine, config.baseline)] if config.baseline else []
+    text = "\n".join(map(to_markdown, tables))
+    write_whole(config.out / f"{config.table}.md", text.encode())
+    print(text)
+    return config.out / f"{config.table}.md"
+
+
+def probe_seams(config: SeamsConfig, avatar: TrainedAvatar, outfit: Outfit) -> SeamTest:
+    """A run asked at the places of an outfit's body, for the frames of a split."""
+    settings, index = avatar.config, outfit_index(avatar, outfit.name)
+    places = seam_places(outfit.template, config.points, config.seed)
+    names = spaced_frames(list(outfit.frames(config.split)), config.frames)
+    frames = []
+    for name in tqdm(names, desc=f"seams of {settings.method.variant} on {outfit.name}", disable=None):
+        frame = outfit.load(config.split, name)
+        cloud = predict(avatar.model, body_batch([frame.body], index, (name,)), places.samples)
+        frames.append(measure_seams(cloud, frame.scan, places))
+    label = Label(
+        settings.method.variant,
+        table=config.table,
+        variant=variant_of(settings),
+        seed=settings.train.seed,
+        steps=avatar.steps,
+        commit=current_commit(),
+    )
+    return SeamTest(label, outfit.dataset, outfit.name, tuple(frames))

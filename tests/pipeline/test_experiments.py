@@ -1,0 +1,180 @@
+"""Experiments: jobs make rows, rows make a table; what is finished is not done again, what fails stops nothing."""
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny import SETTINGS, quick_training
+
+from avatar.checks import AvatarError
+from avatar.data.scanner import ScanConfig
+from avatar.data.splits import SplitConfig
+from avatar.evaluation.forms import Axis, FormConfig, ReportedTable
+from avatar.evaluation.scores import read_scores
+from avatar.evaluation.scoring import ScoreConfig
+from avatar.implicit.extraction import ExtractionConfig
+from avatar.pipeline.comparison import CompareConfig, compare
+from avatar.pipeline.experiments import ExperimentConfig, experiment, tabulate_experiment
+from avatar.training.canonicalizing import CanonicalizeConfig, Skinning
+from avatar.training.runs import MethodChoice
+
+ROOT = Path(__file__).parents[2]
+METRICS = ("cd_point", "normal_l1")
+IMPLICIT = {"avatar": {"sdf": {"widths": [24, 24, 24], "skip": 1, "orders": 4}, "gate_spacing": 0.1}}
+IMPLICIT["train"] = {"probes": {"near_points": 100, "box_points": 50, "rim_points": 30}, "decay_at": []}
+
+
+@pytest.fixture(scope="module")
+def first(tiny_folder, tmp_path_factory) -> ExperimentConfig:
+    """The settings of an experiment's first job, CloSET's static floor on the tiny outfit."""
+    folder = tmp_path_factory.mktemp("experiment")
+    form = FormConfig(rows=(Axis.metric,), columns=(Axis.method,))
+    return ExperimentConfig(
+        method=MethodChoice("closet", "static", SETTINGS | {"pose": False}),
+        dataset=tiny_folder.parent.name,
+        outfit=(tiny_folder.name,),
+        name="small",
+        data_root=tiny_folder.parents[1],
+        runs_root=folder / "runs",
+        train=quick_training(steps=4, points=500, scan_points=500, validate_every=2),
+        points=1000,
+        score=ScoreConfig(scan_points=1000, metrics=list(METRICS)),
+        compare=CompareConfig(
+            table="small",
+            metrics=METRICS,
+            form=form,
+            baseline="static",
+            reported=ReportedTable("a paper, table 9", ("POP",), {"CD": (7.34,)}),
+            pictures=2,
+            out=folder / "results",
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def jobs(first) -> list[ExperimentConfig]:
+    """Three finished jobs: the floor, CloSET, and CloSET from half of the frames."""
+    closet = replace(first, method=MethodChoice("closet", "closet", SETTINGS))
+    found = [first, closet, replace(closet, split=SplitConfig(train_fraction=0.5))]
+    for job in found:
+        experiment(job)
+    return found
+
+
+def test_a_job_leaves_predictions_and_scores_with_what_tells_it_apart(jobs):
+    half = jobs[2].run.folder
+    assert half.name == "small_4steps_0.5_seed0"
+    assert len(list((half / "predictions" / "test" / "tiny").glob("*.ply"))) == 3
+    rows = read_scores(half / "scores.csv").rows
+    assert {row.metric for row in rows} == set(METRICS)
+    assert {(row.method, row.variant, row.fraction, row.steps, row.dataset) for row in rows} == {
+        ("closet", "50%", 0.5, 4, "open")
+    }
+
+
+def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs):
+    run = jobs[1].run.folder
+    (run / "predictions" / "test" / "tiny" / "check.00000.ply").unlink()
+    weights, scores = (run / "avatar.safetensors").read_bytes(), (run / "scores.csv").stat().st_mtime_ns
+    experiment(jobs[1])
+    assert (run / "avatar.safetensors").read_bytes() == weights
+    assert (run / "scores.csv").stat().st_mtime_ns == scores
+    assert not (run / "predictions" / "test" / "tiny" / "check.00000.ply").is_file()
+    experiment(replace(jobs[1], score=replace(jobs[1].score, seed=5)))
+    assert (run / "scores.csv").stat().st_mtime_ns > scores
+    assert (run / "predictions" / "test" / "tiny" / "check.00000.ply").is_file()
+    experiment(jobs[1])
+
+
+def test_the_table_has_every_form(jobs):
+    out = jobs[0].compare.out
+    text = tabulate_experiment(jobs).read_text()
+    assert "| metric | sampling | body | static | closet | closet (50%) |" in text
+    assert "Equal steps: 4 each." in text and "Reported: a paper, table 9" in text and "excess over the" in text
+    made = {path.name.removeprefix("small.") for path in out.iterdir()}
+    pictures = {f"{name}.png" for name in ("outfits", "times", "fractions", "progress", "poses")}
+    assert made == {"csv", "frames.csv", "md", "tex", "differences.csv"} | pictures
+    tex = (out / "small.tex").read_text()
+    assert tex.count("\\begin{tabular}") == tex.count("\\end{tabular}") == text.count("\n|---")
+    assert "closet (50\\%)" in tex
+    rows = read_scores(out / "small.csv").rows
+    assert {row.table for row in rows} == {"small"}
+    expected = sum(len(read_scores(job.run.folder / "scores.csv").rows) for job in jobs)
+    assert len([row for row in rows if row.method in ("static", "closet")]) == expected
+    sheet = np.asarray(Image.open(out / "small.poses.png"))
+    assert 2 * 600 < sheet.shape[0] < 3 * 600 and 4 * 400 < sheet.shape[1] < 5 * 400  # two poses, three methods, truth
+
+
+def test_scores_of_a_foreign_program_stand_in_the_same_table(jobs, tmp_path, tiny_folder):
+    theirs = tmp_path / "theirs"
+    shutil.copytree(jobs[1].run.folder / "predictions" / "test" / "tiny", theirs)
+    scores = (jobs[1].run.folder / "scores.csv").read_text().replace(",closet,", ",theirs,")
+    (theirs / "scores.csv").write_text(scores)
+    config = replace(jobs[0].compare, runs=(jobs[0].run.folder, theirs), runs_root=jobs[0].runs_root, out=tmp_path)
+    text = compare(replace(config, data_root=tiny_folder.parents[1], plots=False)).read_text()
+    assert "| metric | sampling | body | static | theirs |" in text
+    assert np.asarray(Image.open(tmp_path / "small.poses.png")).shape[1] > 3 * 400
+
+
+def test_outfits_of_one_name_in_two_data_sets_are_refused(jobs, tmp_path):
+    shutil.copytree(jobs[1].run.folder, tmp_path / "run")
+    path = tmp_path / "run" / "scores.csv"
+    path.write_text(path.read_text().replace(",open,", ",elsewhere,"))
+    config = replace(jobs[0].compare, runs=(jobs[0].run.folder, tmp_path / "run"), out=tmp_path)
+    with pytest.raises(AvatarError, match=r"outfit 'tiny' is in several data sets \(elsewhere, open\)"):
+        compare(config)
+
+
+def test_two_trainings_that_nothing_tells_apart_are_refused(jobs, tmp_path):
+    shutil.copytree(jobs[1].run.folder, tmp_path / "run")
+    config = replace(jobs[0].compare, runs=(jobs[1].run.folder, tmp_path / "run"), out=tmp_path, pictures=0)
+    with pytest.raises(AvatarError, match="two scores of cd_point for closet on tiny, seed 0"):
+        compare(config)
+
+
+@pytest.mark.slow
+def test_a_method_that_takes_a_canonicalizer_gets_it_made_and_scored(first, tiny_outfit, tmp_path):
+    canonicalizer = CanonicalizeConfig(weights=Skinning.knn, scan=ScanConfig(points=2000), scored=1)
+    job = replace(
+        first,
+        method=MethodChoice("scanimate", "scanimate", IMPLICIT),
+        canonical="knn",
+        canonicalizer=canonicalizer,
+        surface=ExtractionConfig(32),
+        compare=replace(first.compare, baseline="", pictures=0, out=tmp_path),
+    )
+    run = experiment(job)
+    scans = first.runs_root / "canonical" / "open" / "tiny" / "knn" / "scans"
+    assert {path.stem for path in scans.glob("*/*.npz")} == {
+        name for split in ("train", "test") for name in tiny_outfit.frames(split)
+    }
+    assert (run / "meshes" / "test" / "tiny").is_dir()
+    text = tabulate_experiment([job]).read_text()
+    assert "scanimate" in text and "All methods: knn." in text
+    assert "**tiny: canonical scans of test frames**" in text and "| truth_cm (cm) |" in text
+
+
+@pytest.mark.slow
+def test_one_command_runs_all_jobs_names_the_failure_and_tables_the_rest(tiny_folder, tmp_path):
+    for name in ("one", "two"):
+        shutil.copytree(tiny_folder, tmp_path / "data" / "open" / name)
+    for frame in (tmp_path / "data/open/two/train").glob("*.npz"):
+        frame.write_bytes(frame.read_bytes()[:1000])
+    options = "experiment=closet5 dataset=open outfit=one,two method=static train.steps=2 train.points=500 points=1000"
+    options += " train.scan_points=500 train.batch=1 train.mirror=false score.scan_points=500 compare.baseline=static"
+    options += " compare.metrics=[cd_point] compare.pictures=0 compare.plots=false compare.out=out"
+    line = [sys.executable, str(ROOT / "tools/experiment.py"), *options.split()]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 2, done.stderr
+    assert "2 jobs: 1 finished, 1 failed." in done.stderr and "Traceback" not in done.stderr
+    failed = [line for line in done.stderr.splitlines() if line.startswith("  failed: ")]
+    assert len(failed) == 1 and "outfit=two" in failed[0] and ".npz" in failed[0]
+    assert {row.method for row in read_scores(tmp_path / "out/closet5.csv").rows} == {"sampling", "body", "static"}
+    assert "Reported: CloSET, table 5" in (tmp_path / "out/closet5.md").read_text()
