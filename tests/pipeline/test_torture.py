@@ -46,9 +46,9 @@ def unmet(findings: list[Finding]) -> list[str]:
 SHORT = {
     "kill": lambda root: kill_trial(root, 2, 1, seed=1),
     "flips": lambda root: flip_trial(root, 30, 10, seed=1),
-    "poison": lambda root: poison_trial(root, 6, seed=1),
+    "poison": lambda root: poison_trial(root, 3, seed=1),
     "race": lambda root: race_trial(root, 1),
-    "fuzz": lambda root: fuzz_trial(root, 300, seed=1),
+    "fuzz": lambda root: fuzz_trial(root, 200, seed=1),
     "bombs": bomb_trial,
     "names": lambda root: name_trial(root, 8, seed=1),
     "mesh": lambda root: mesh_trial(20),
