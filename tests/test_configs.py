@@ -9,8 +9,8 @@ import pytest
 import yaml
 from hydra.errors import HydraException
 
-from avatar.checks import AvatarError
-from avatar.config import CONF, VERBS
+from avatar.checks import AvatarError, DataError
+from avatar.config import CONF, VERBS, refuse_code
 from avatar.config import compose_settings as load
 from avatar.pipeline.methods import find_settings
 from avatar.settings import settings_from_dict
@@ -96,6 +96,41 @@ def test_what_is_wrong_is_refused(override, message):
         return
     with pytest.raises((AvatarError, HydraException), match=message):
         load("train", override)
+
+
+STRANGERS = {
+    "callback": ("a.yaml", "# @package _global_\nhydra: {callbacks: {a: {_target_: os.system}}}"),
+    "hidden word": ("a.yaml", '"hy\\x64ra": 1'),
+    "package": ("a.yaml", "# @package hydra.launcher\nn_jobs: 1"),
+    "defaults": ("a.yaml", "defaults: [x@hydra.sweeper: y]"),
+    "object": ("group/a.yml", "model: {_target_: builtins.eval}"),
+    "log handler": ("group/a.yaml", "x: {'()': os.system}"),
+    "environment": ("a.yaml", "name: ${oc.env:HOME}"),
+    "folder": ("hydra/launcher/a.yaml", "n_jobs: 1"),
+    "tag": ("a.yaml", "a: !!python/name:os.system ''"),
+}
+
+
+@pytest.mark.parametrize("what", STRANGERS)
+@pytest.mark.parametrize("option", ["--config-dir", "--config-d=", "-cd", "--config-path="])
+def test_a_configuration_from_elsewhere_is_no_code(tmp_path, what, option):
+    name, text = STRANGERS[what]
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    line = [f"{option}{tmp_path}"] if option.endswith("=") else [option, str(tmp_path)]
+    with pytest.raises(DataError, match=path.name):
+        refuse_code(["outfit=tee", *line])
+    path.write_text("train:\n  lr: 0.001\nname: ${method.variant}\n")
+    if what == "folder":
+        path.unlink()
+    refuse_code(line)
+
+
+def test_hydra_looks_nowhere_else_and_loads_no_pickle():
+    for argument in ("hydra.searchpath=[file:///tmp]", "+hydra.searchpath=[x]", "--experimental-rerun=job.pickle"):
+        with pytest.raises(AvatarError, match="not taken here"):
+            refuse_code([argument])
 
 
 def test_bad_input_ends_in_one_line_and_code_2(tmp_path):

@@ -37,6 +37,14 @@ def test_round_trip(settings):
     assert settings_from_dict(type(settings), settings_to_dict(settings)) == settings
 
 
+def test_numbers_that_are_none_and_ranges_are_refused_with_their_place():
+    for value in (float("nan"), float("inf")):
+        with pytest.raises(AvatarError, match="file: rate: expected a finite number"):
+            settings_from_dict(Outer, {"rate": value}, "file: ")
+    with pytest.raises(AvatarError, match="file: steps: expected at least 1"):
+        settings_from_dict(TrainConfig, {"steps": 0}, "file: ")
+
+
 def test_numbers_and_names_are_converted():
     made = settings_from_dict(Outer, {"rate": 2, "limit": 3, "where": "x", "inner": {"colour": "red", "sizes": [[4]]}})
     assert (made.rate, made.limit, made.where, made.inner.sizes) == (2.0, 3.0, Path("x"), ((4,),))

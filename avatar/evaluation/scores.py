@@ -66,13 +66,16 @@ class Scores:
 
 
 def write_scores(path: str | Path, scores: Scores) -> None:
-    """Writes the means to a CSV and the single frames to ``<stem>.frames.csv`` beside it, both whole or not at all.
+    """Writes the means to a CSV and single frames, if any, to ``<stem>.frames.csv`` beside it, whole or not at all.
 
     Numbers are written so that reading gives back the same bits.
     """
     path = Path(path)
     write_whole(path, _to_csv(Score, scores.rows))
-    write_whole(frames_path(path), _to_csv(FrameScore, scores.frames))
+    if scores.frames:
+        write_whole(frames_path(path), _to_csv(FrameScore, scores.frames))
+    else:
+        frames_path(path).unlink(missing_ok=True)
 
 
 def read_scores(path: str | Path) -> Scores:

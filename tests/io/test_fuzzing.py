@@ -26,7 +26,7 @@ def good(request, tmp_path_factory):
 
 
 @pytest.mark.filterwarnings("ignore")
-@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_a_spoilt_file_is_sound_or_refused_by_name(good, data):
     kind, path, sound = good

@@ -87,6 +87,16 @@ def test_unsound_frames_are_refused(tmp_path, frame):
     assert not (tmp_path / "a.npz").exists()
 
 
+@pytest.mark.parametrize("key", ["origin", "translation"])
+def test_frames_beyond_the_horizon_are_refused(tmp_path, frame, key):
+    write_open_frame(tmp_path / "f.npz", frame)
+    with np.load(tmp_path / "f.npz") as stored:
+        arrays = dict(stored)
+    np.savez(tmp_path / "f.npz", **(arrays | {key: np.full(3, 1e30, np.float32)}))
+    with pytest.raises(DataError, match=f"{key}: expected metres"):
+        read_open_frame(tmp_path / "f.npz")
+
+
 def test_other_versions_and_miscounted_faces_are_refused(tmp_path, frame):
     write_open_frame(tmp_path / "a.npz", frame)
     with np.load(tmp_path / "a.npz") as stored:

@@ -1,6 +1,7 @@
 """Motion files: AMASS, our own, BVH; conventions, resampling and broken files."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.open import open_body
-from avatar.checks import AvatarError, DataError
+from avatar.checks import AvatarError, DataError, check_name
 from avatar.io.motions import read_motion, resample_motion, write_motion
 from avatar.io.npz import write_arrays
 from avatar.records import Motion
@@ -83,6 +84,13 @@ def write_bvh(
     lines += [" ".join(f"{value:.9f}" for value in row) for row in np.concatenate(columns, axis=1)]
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+@pytest.mark.parametrize("name", ["../../up", "/etc/up", "a b", "..", "", "\0", "x" * 200])
+def test_a_motion_s_name_can_only_be_a_file_s(tmp_path, walk, name):
+    write_motion(tmp_path / "a.npz", replace(walk, name=name))
+    found = read_motion(tmp_path / "a.npz").name
+    assert check_name("name", found) == found and (tmp_path / found).parent == tmp_path
 
 
 def test_our_own_file_round_trips(tmp_path, walk):
@@ -257,6 +265,7 @@ def test_damaged_bvh_files_are_one_error(tmp_path, walk):
     broken = [text[: rng.integers(len(text))] for _ in range(40)]
     broken += [text.replace("Frames: 45", "Frames: 44"), text.replace("OFFSET", "OFSET", 1), "", "\0\1", "HIERARCHY"]
     broken += [text.replace("Xrotation", "Wrotation", 1), text.replace("Frame Time: 0.0", "Frame Time: nan ")]
+    broken += [text.replace("OFFSET", f"OFFSET {wild}", 1) for wild in ("nan", "inf", "1e300")]
     broken += [text.replace("CHANNELS 3", "CHANNELS 99999999", 1), text.replace("}", "", 1)]
     for number, content in enumerate(broken):
         (tmp_path / "b.bvh").write_text(content)

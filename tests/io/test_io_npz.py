@@ -95,6 +95,22 @@ def test_a_header_that_promises_more_than_the_file_holds_is_refused_before_alloc
         read_arrays(path, {"points": "float N"})
 
 
+def test_a_file_that_swells_is_refused_before_it_does(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", x=np.zeros(5 << 20))
+    with pytest.raises(DataError, match="it swells from"):
+        read_arrays(tmp_path / "a.npz", {"x": "float N"})
+    np.savez_compressed(tmp_path / "b.npz", x=np.random.default_rng(0).random(3 << 20))
+    assert len(read_arrays(tmp_path / "b.npz", {"x": "float N"})["x"]) == 3 << 20
+
+
+def test_a_header_that_is_no_header_is_one_error(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (3,"  # numpy hands it to Python's tokenizer
+        archive.writestr("x.npy", b"\x93NUMPY\x01\x00" + bytes([len(header), 0]) + header)
+    with pytest.raises(DataError, match="x: expected a plain array"):
+        read_arrays(tmp_path / "a.npz", {"x": "float N"})
+
+
 def test_oversized_and_overcrowded_files_are_refused(tmp_path, arrays):
     write_arrays(tmp_path / "a.npz", {"zeros": np.zeros(100_000)})
     with pytest.raises(DataError, match="at most 1000 bytes of arrays"):

@@ -10,14 +10,14 @@ import torch
 from avatar.body.open import open_body
 from avatar.body.packed import write_body, write_template
 from avatar.checks import AvatarError, DataError
-from avatar.io.frames import OpenFrame, read_open_frame, write_open_frame
+from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, write_open_frame, write_open_garment
 from avatar.records import Motion
 from avatar.simulate import gates as gates_module
 from avatar.simulate.dressing import Rest, bind_pose, pose_path
 from avatar.simulate.gates import GateConfig, edge_stretch, frame_names, missed, record_frame
 from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.poses import NamedPose
-from avatar.simulate.production import is_sound, wearer
+from avatar.simulate.production import FrameLedger, is_sound, wearer
 from avatar.simulate.recording import (
     PRESETS,
     SimulateConfig,
@@ -186,6 +186,22 @@ def test_only_sound_frames_are_kept(tmp_path):
     assert not is_sound(path, POSE.pose + 0.1, 3) and not is_sound(path, POSE.pose, 4)
     path.write_bytes(path.read_bytes()[:-20])
     assert not is_sound(path, POSE.pose, 3)
+
+
+def test_finished_frames_are_known_by_hash_and_those_of_older_versions_taken_over(tmp_path):
+    garment = OpenGarment(np.array([[0, 1, 2]]), np.zeros((3, 3), np.float32), np.ones(3, np.uint8), ("tee",))
+    write_open_garment(tmp_path / "garment.npz", garment)
+    path, cloth = tmp_path / "train" / "f.npz", np.zeros((3, 3), np.float32)
+    frame = OpenFrame(POSE.pose, np.zeros(3), cloth, np.ones(4, bool), np.ones(1, bool))
+    assert not FrameLedger(tmp_path, 3).has(path, POSE.pose)
+    write_open_frame(path, frame)
+    assert FrameLedger(tmp_path, 3).has(path, POSE.pose)  # no ledger knew of it
+    assert not FrameLedger(tmp_path, 3).has(path, POSE.pose + 0.1)
+    write_open_frame(path, replace(frame, cloth=cloth + 0.01))  # sound, and not what was finished
+    assert not FrameLedger(tmp_path, 3).has(path, POSE.pose)
+    FrameLedger(tmp_path, 3).note_all([(path, POSE.pose), (path.with_name("refused.npz"), POSE.pose)])
+    assert FrameLedger(tmp_path, 3).has(path, POSE.pose)
+    assert not FrameLedger(tmp_path, 3).has(path.with_name("refused.npz"), POSE.pose)
 
 
 def test_frame_names_count_from_zero():

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import random
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from avatar.checks import AvatarError
 from avatar.data.layouts import find_outfit
 from avatar.io.frames import check_manifest
+from avatar.io.ledger import digest_of
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.scores import PredictConfig, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
@@ -66,7 +67,7 @@ def name_trial(root: Path, count: int, seed: int) -> list[Finding]:
     return [
         none_of("names", "names by which anything was written outside the roots", outside, count),
         none_of("names", "that ended in another error than ours", untyped, count),
-        Finding("names", "doors that each was given to", len(doors(root)), "doors", count),
+        Finding("names", "doors that each was given to", len(Doors(root).all()), "doors", count),
     ]
 
 
@@ -80,14 +81,14 @@ def try_names(root: Path, names: list[str]) -> dict[str, list[str]]:
     outside, untyped = [], []
     for name in names:
         written.clear()
-        for door in doors(root):
+        for door in Doors(root).all():
             try:
                 door(name)
             except AvatarError:
                 continue
             except Exception as error:
                 untyped.append(f"{name!r} {error!r:.300}")
-        strays = [path for path in written if not os.path.realpath(path).startswith(allowed)]  # noqa: PTH
+        strays = [path for path in written if not os.path.realpath(path).startswith(allowed)]
         outside += [f"{name!r} {strays[:3]}"] if strays else []
     return {"outside": outside, "untyped": untyped}
 
@@ -105,66 +106,69 @@ def places_written(event: str, arguments: tuple[Any, ...]) -> list[str]:
     return []
 
 
-def doors(root: Path) -> list[Callable[[str], Any]]:
+class Doors:
     """Where a name can come in: settings, files of others, and the names inside them."""
-    run = folder_of("closet", root, "named")
-    plain = settings_to_dict(run_config("closet", root))
 
-    def settings(**changes: Any) -> RunConfig:
-        return settings_from_dict(RunConfig, plain | changes)
+    def __init__(self, root: Path):
+        self.root, self.run = root, folder_of("closet", root, "named")
+        self.plain = settings_to_dict(run_config("closet", root))
 
-    def forged(name: str) -> None:
-        """A run from elsewhere whose description gives its outfit, its run and its variant this name."""
-        folder = root / "runs" / "forged"
-        shutil.copytree(run, folder, dirs_exist_ok=True)
-        description = json.loads((run / "avatar.json").read_text())
+    def all(self) -> list[Callable[[str], Any]]:
+        """Every door, as a function of the name."""
+        root, save = self.root, self.save_run
+        return [
+            lambda name: save(name=name),
+            lambda name: save(dataset=name),
+            lambda name: save(outfit=[name]),
+            lambda name: save(outfit=["tee", name]),
+            lambda name: save(method=self.plain["method"] | {"variant": name}),
+            lambda name: save(canonical=name),
+            lambda name: save_settings(canonicalizer_config(root, name)),
+            lambda name: FitConfig(outfit=name, runs_root=root / "runs"),
+            lambda name: find_outfit(root / "data", name, OUTFIT),
+            lambda name: find_outfit(root / "data", DATASET, name),
+            lambda name: mesh(MeshConfig(run=self.run, predictions=name)),
+            lambda name: ExportConfig(run=self.run, predictions=name),
+            lambda name: CompareConfig(table=name),
+            self.forge_run,
+            self.name_motion,
+            self.list_checkpoint,
+            self.list_data,
+        ]
+
+    def save_run(self, **changes: Any) -> None:
+        """A run's settings, written to the folder they name."""
+        save_settings(settings_from_dict(RunConfig, self.plain | changes))
+
+    def forge_run(self, name: str) -> None:
+        """A run from elsewhere whose description gives its outfit, its run and its data set this name."""
+        folder = self.root / "runs" / "forged"
+        shutil.copytree(self.run, folder, dirs_exist_ok=True)
+        description = json.loads((self.run / "avatar.json").read_text())
         for change in ({"outfit": [name]}, {"name": name}, {"dataset": name}):
             (folder / "avatar.json").write_text(json.dumps(description | {"config": description["config"] | change}))
-            try:
+            with suppress(AvatarError):
                 mesh(MeshConfig(run=folder, formats=("ply",)))
-            except AvatarError:
-                continue
 
-    def moved(name: str) -> None:
+    def name_motion(self, name: str) -> None:
         """A motion whose file gives it this name."""
-        path = root / "runs" / "motion.npz"
+        path = self.root / "runs" / "motion.npz"
         arrays = {"poses": np.zeros((1, 22, 3), np.float32), "translations": np.zeros((1, 3), np.float32)}
         np.savez(path, **arrays, fps=np.array(30.0), format=np.array("motion/1"), name=np.array(name))
-        predict(PredictConfig(run=run, motion=path, points=1000, device="cpu"))
+        predict(PredictConfig(run=self.run, motion=path, points=1000, device="cpu"))
 
-    def listed(name: str) -> None:
+    def list_checkpoint(self, name: str) -> None:
         """A checkpoint that the manifest says is elsewhere, under a right seal."""
-        folder = root / "runs" / "listed"
+        folder = self.root / "runs" / "listed"
         folder.mkdir(exist_ok=True)
         entries = {"last": [{"file": name, "step": 1, "score": None, "sha256": "0" * 64}]}
-        seal = hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
-        (folder / "manifest.json").write_text(json.dumps({**entries, "sha256": seal}))
+        (folder / "manifest.json").write_text(json.dumps({**entries, "sha256": digest_of(entries)}))
         load_checkpoint(folder)
 
-    def data_manifest(name: str) -> None:
+    def list_data(self, name: str) -> None:
         """A data set whose manifest lists this file."""
-        folder = root / "data" / "listed"
+        folder = self.root / "data" / "listed"
         folder.mkdir(exist_ok=True)
         files = {name: {"size": 0, "sha256": ""}}
         (folder / "manifest.json").write_text(json.dumps({"format": "manifest/1", "files": files}))
         check_manifest(folder)
-
-    return [
-        lambda name: save_settings(settings(name=name)),
-        lambda name: save_settings(settings(dataset=name)),
-        lambda name: save_settings(settings(outfit=[name])),
-        lambda name: save_settings(settings(outfit=["tee", name])),
-        lambda name: save_settings(settings(method=plain["method"] | {"variant": name})),
-        lambda name: save_settings(settings(canonical=name)),
-        lambda name: save_settings(canonicalizer_config(root, name)),
-        lambda name: FitConfig(outfit=name, runs_root=root / "runs"),
-        lambda name: find_outfit(root / "data", name, OUTFIT),
-        lambda name: find_outfit(root / "data", DATASET, name),
-        lambda name: mesh(MeshConfig(run=run, predictions=name)),
-        lambda name: ExportConfig(run=run, predictions=name),
-        lambda name: CompareConfig(table=name),
-        forged,
-        moved,
-        listed,
-        data_manifest,
-    ]

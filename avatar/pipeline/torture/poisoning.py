@@ -70,7 +70,8 @@ def train_poisoned(job: str, root: Path, name: str, place: str, once: bool, step
         def train_step(trainer: Any, *batch: Any) -> Any:
             state.update(step=trainer.step, trainer=trainer)
             if place == "weight" and trainer.step == step:
-                next(trainer.model.parameters()).data.view(-1)[0] = math.nan
+                largest = max((p for p in trainer.model.parameters() if p.requires_grad), key=Tensor.numel)
+                largest.data.view(-1)[0] = math.nan  # a small one, such as a frame's code, is in few batches
             if place == "scan point" and due() and batch:
                 batch = (poison_points(batch[0]),)
             before = [parameter.detach().clone() for parameter in trainer.model.parameters()] if due() else []

@@ -72,7 +72,7 @@ def small_disk(place: Path) -> Iterator[bool]:
         yield mounted
     finally:
         if mounted:
-            subprocess.run(["umount", str(place)], check=True)
+            subprocess.run(["umount", "--lazy", str(place)], check=True)  # a victim may not be quite gone
 
 
 def fill(place: Path, room: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -50,7 +51,7 @@ class TortureConfig:
     meshes: int = 1000  # frames meshed
     demo_minutes: float = 0.2  # training time of the demo without a network
     stream_gb: float = 10.0  # size of the outfit that is streamed
-    stream_frames: int = 400  # frames of it that training reads
+    stream_frames: int = 240  # frames of it that training reads
     seed: int = 0
     again: bool = False  # do finished trials of the same size again
     root: Path = Path("runs/torture")  # where to work; emptied trial by trial
@@ -103,6 +104,7 @@ def torture(config: TortureConfig) -> Path:
             log.info("%s: done before.", name)
             continue
         log.info("%s: %s", name, ", ".join(f"{key}={value}" for key, value in counts.items()))
+        shutil.rmtree(root / name, ignore_errors=True)
         started, commit = time.monotonic(), current_commit()
         findings = trial(config, root / name)
         seconds = time.monotonic() - started
