@@ -24,6 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import avatar.environment  # noqa: F401  first of all: it says how threads wait, which torch reads when it is imported
 from avatar.checks import AvatarError
+from avatar.pipeline.benchmarks.bench import BenchConfig
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.demo import DemoConfig
 from avatar.pipeline.methods import SETTINGS
@@ -52,6 +53,7 @@ VERBS = {
     "report": ReportConfig,
     "demo": DemoConfig,
     "simulate": SimulateConfig,
+    "bench": BenchConfig,
 }
 Settings = TypeVar("Settings")
 
