@@ -54,10 +54,10 @@ def growth_figures(job: Job, repeats: int) -> list[Figure]:
 
     Scan points go with the points. The sizes run in turns, as contenders of races do.
     """
-    usual = {"points": job.size(5000, 200), "subdivisions": job.size(5, 4), "outfits": 1, "frames": 4}
+    usual = {"points": job.size(5000, 200), "subdivisions": job.size(5, 3), "outfits": 1, "frames": 4}
     varied = {
         "points": [job.size(count, count // 50) for count in (5000, 10_000, 20_000, 40_000)],
-        "subdivisions": [job.size(5, 4), job.size(6, 5)],
+        "subdivisions": [job.size(5, 3), job.size(6, 4)],
         "outfits": [1, 2, 4],
         "frames": [1, 2, 4, 8],
     }
