@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -43,6 +45,8 @@ def _measure(build: Callable[[Job], list[Race]], job: Job, race: int, contender:
         before = torch.cuda.memory_allocated()
         run()
         return (torch.cuda.max_memory_allocated() - before) / 2**20
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)  # what preparing has freed would else be used again, and not be seen
     Path(f"/proc/{os.getpid()}/clear_refs").write_text("5")  # the peak starts anew from what is resident now
     before = _kibibytes("VmRSS")
     run()
