@@ -80,7 +80,7 @@ def step_races(job: Job) -> list[Race]:
         (job.labels, job.largest_pop, job.size(50_000, 400), job.size(40_000, 300)),
         (small, "pop_small", job.size(10_000, 300), job.size(10_000, 200)),
     ):
-        frames = job.size(4, 2)
+        frames = job.size(job.frames, 2)
         contenders, absent = avatar_contenders(job, make_step, labels, points, frames, scan_points)
         case = f"{points:,} points, {frames} frames"
         if base in contenders:

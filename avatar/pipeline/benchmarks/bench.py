@@ -16,7 +16,6 @@ import torch
 
 from avatar.checks import AvatarError
 from avatar.data.outfits import SAFE_NAME
-from avatar.environment import keep_freed_memory
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.io.npz import write_whole
 from avatar.pipeline.benchmarks.avatars import predict_races, step_races
@@ -54,6 +53,7 @@ class BenchConfig:
     only: tuple[str, ...] = ()  # topics; empty for all
     repeats: int = 5  # rounds that a median is over
     quick: bool = False  # small sizes, for tests
+    frames: int = 4  # of a training step; four of full size take 18 GB while contenders share a process
     memory: bool = True  # also each contender's peak memory, in a process of its own
     avatars: dict[str, dict[str, Any]] = field(default_factory=lambda: {"closet_full": {}, "pop_full": {}})
     canonicalizers: dict[str, dict[str, Any]] = field(default_factory=lambda: {"full": {}})
@@ -65,8 +65,8 @@ class BenchConfig:
         unknown = [topic for topic in self.only if topic not in RACES | OTHERS]
         if unknown:
             raise AvatarError(f"only: expected some of {', '.join(RACES | OTHERS)}, got {', '.join(unknown)}.")
-        if self.repeats < 1:
-            raise AvatarError(f"repeats: expected at least 1, got {self.repeats}.")
+        if min(self.repeats, self.frames) < 1:
+            raise AvatarError(f"repeats, frames: expected at least 1, got {self.repeats} and {self.frames}.")
         if not SAFE_NAME.fullmatch(self.table):
             raise AvatarError(f"table: expected a plain name, got {self.table!r}.")
 
@@ -79,8 +79,7 @@ def bench(config: BenchConfig) -> Path:
     Raises:
         AvatarError: for labels of networks there are no settings for.
     """
-    keep_freed_memory()  # as training does
-    job = Job(config.quick, choose_device(config.device).type, config.avatars, config.canonicalizers)
+    job = Job(config.quick, choose_device(config.device).type, config.avatars, config.canonicalizers, config.frames)
     scores = machine_rows(config)
     for topic in config.only or (*RACES, *OTHERS):
         load = Figure(topic, "", MACHINE, "load", os.getloadavg()[0], "1")

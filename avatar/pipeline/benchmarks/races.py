@@ -35,6 +35,7 @@ class Job:
     device: str
     avatars: dict[str, dict[str, Any]]
     canonicalizers: dict[str, dict[str, Any]]
+    frames: int = 4  # of a training step
 
     @property
     def labels(self) -> list[str]:
