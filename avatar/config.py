@@ -27,6 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 import avatar.environment  # noqa: F401  first of all: it says how threads wait, which torch reads when it is imported
 from avatar.checks import AvatarError, DataError
 from avatar.io.documents import check_events, read_yaml
+from avatar.pipeline.benchmarks.bench import BenchConfig
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.demo import DemoConfig
 from avatar.pipeline.experiments import ExperimentConfig
@@ -61,6 +62,7 @@ VERBS = {
     "demo": DemoConfig,
     "simulate": SimulateConfig,
     "torture": TortureConfig,
+    "bench": BenchConfig,
 }
 Settings = TypeVar("Settings")
 
