@@ -52,7 +52,7 @@ def compare_methods(
         pair = [row for row in frames if method_key(row) in (method, other)]
         shared = _shared_outfits(pair, method, other)
         groups = [(outfit, [row for row in pair if row.outfit == outfit]) for outfit in shared]
-        groups += [(ALL, [row for row in pair if row.outfit in shared])] if len(shared) > 1 else []
+        groups += [(ALL, pair)] if len(shared) > 1 else []
         for outfit, mine in groups:
             interval = bootstrap_difference(mine, metric, method, other, resamples, confidence)
             found.append(Difference(metric, outfit, method, other, interval))

@@ -382,7 +382,7 @@ def test_smpl_files_take_an_atlas_from_an_obj_of_their_mesh(places, tmp_path):
 
 def test_a_given_obj_comes_before_the_files_own_atlas(places, tmp_path):
     model = distinct(vars(random_model("smplx")))
-    np.savez(tmp_path / "model.npz", **unwrapped(model, places))
+    np.savez(tmp_path / "model.npz", **unwrapped(model, places) | {"ft": np.full((30, 3), 90)})  # which is unsound
     obj = write_unwrapped(tmp_path / "uv.obj", model, 1 - places)
     convert_body_model(tmp_path / "model.npz", tmp_path / "plain.npz", obj)
     template = smpl_body(tmp_path / "plain.npz").template

@@ -22,7 +22,7 @@ from avatar.evaluation.seams import (
     seam_places,
 )
 from avatar.geometry.surface import interpolate
-from avatar.geometry.uv import seam_edges
+from avatar.geometry.uv import sample_uv, seam_edges
 from avatar.records import PointCloud, Scan, Template
 
 CELLS, SIDE = 20, 0.4  # a sheet of 20 x 20 squares, 40 cm wide, cut at x = 0
@@ -78,6 +78,19 @@ def test_both_sides_of_an_edge_are_one_place_of_two_triangles():
     assert (sides.left.face_ids != sides.right.face_ids).all()
     border = torch.tensor([[0, 1]])
     assert len(edge_sides(template.faces, border).left.face_ids) == 0
+
+
+def test_other_edges_are_all_but_the_seams():
+    template = sheet()
+    places = seam_places(template, 10, seed=0)
+
+    def apart(sides):
+        left, right = (sample_uv(template.uv, template.uv_faces, side) for side in (sides.left, sides.right))
+        return (left - right).norm(dim=1)
+
+    assert apart(places.seams).min() > 0.1 and len(places.seams.left.face_ids) == CELLS
+    every = [seam_places(template, 10, seed=seed).others for seed in range(40)]  # 800 draws of 1,240 edges
+    assert max(float(apart(others).max()) for others in every) < 1e-6
 
 
 def test_the_known_jump_is_found_at_seams_and_none_at_other_edges():

@@ -1,6 +1,7 @@
 """Tables: numbers, floors, definitions and the three formats."""
 
 import csv
+from dataclasses import replace
 
 import pytest
 
@@ -43,6 +44,17 @@ def test_excess_and_its_shares_of_the_floors():
     assert (of_static["dress"]["closet"], of_static["long_shirt"]["closet"]) == pytest.approx((0.8, 0.5))
     assert of_static["mean over outfits"]["closet"] == pytest.approx(0.65)
     assert of_static["max over outfits"]["closet"] == pytest.approx(0.8)
+
+
+def test_each_variant_is_measured_by_its_own_static_floor():
+    rows = some_rows()
+    extra = {"static": 11e-4, "closet": 6e-4}
+    rows += [replace(r, variant="10%", value=extra[r.method]) for r in rows if r.method in extra]
+    of_static = cells(outfit_table(rows, "cd_point", View.OF_STATIC))["dress"]
+    assert of_static["closet"] == pytest.approx(0.8) and of_static["closet (10%)"] == pytest.approx(0.5)
+    without = [r for r in rows if (r.method, r.variant) != ("static", "10%")]
+    lone = cells(outfit_table(without, "cd_point", View.OF_STATIC))["dress"]
+    assert lone["closet (10%)"] == pytest.approx(1.0)  # the only floor there is
 
 
 def test_the_worst_of_a_metric_where_higher_is_better_is_its_minimum():
