@@ -44,7 +44,7 @@ def test_every_method_and_size_gives_its_settings(method, size):
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes_and_says_how_to_run_it(experiment):
     config = load("experiment", f"experiment={experiment}")
-    assert config.compare.table == experiment and config.run.name.startswith(experiment)
+    assert config.compare.table == experiment and config.run.name.startswith((experiment, "paper"))
     assert set(config.score.metrics) == set(config.compare.metrics)
     lines = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[:2] == ["# @package _global_", f"# python tools/experiment.py experiment={experiment}"]

@@ -9,7 +9,9 @@ import pytest
 from PIL import Image
 from tiny import SETTINGS, quick_training
 
+from avatar.canonical.posed import DrawConfig
 from avatar.checks import AvatarError, DataError
+from avatar.data.scanner import ScanConfig
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.io.meshes import read_mesh
@@ -20,6 +22,8 @@ from avatar.pipeline.demo import DemoConfig, demo
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
 from avatar.simulate.sequences import authored_motion
+from avatar.training.canonicalizing import CanonicalizeConfig
+from avatar.training.cycles import CycleConfig
 from avatar.training.runs import MethodChoice
 
 pytestmark = pytest.mark.slow
@@ -36,6 +40,11 @@ def job(tiny_folder, tmp_path_factory) -> tuple[DemoConfig, dict]:
         outfit=(tiny_folder.name,),
         data_root=tiny_folder.parents[1],
         runs_root=tmp_path_factory.mktemp("runs"),
+        canonicalizer=CanonicalizeConfig(
+            scan=ScanConfig(points=2000),
+            train=CycleConfig(first_steps=5, second_steps=5, draw=DrawConfig(pool=500), code_steps=2),
+            pictures=1,
+        ),
         train=train,
         points=12_000,
         meshes=2,
@@ -47,10 +56,12 @@ def job(tiny_folder, tmp_path_factory) -> tuple[DemoConfig, dict]:
 
 def test_summary_names_every_stage_and_file(job):
     config, summary = job
-    stages = {"train", "train static floor", "predict", "evaluate", "mesh", "report", "total"}
+    stages = {"canonicalize", "train", "train static floor", "predict", "evaluate", "mesh", "report", "total"}
     assert set(summary["seconds"]) == stages
     made = summary["made"]
     assert all(Path(path).exists() for path in (made["report"], made["weights"], *made["points"], *made["meshes"]))
+    (scans,) = (Path(path) for path in made["canonical scans"])
+    assert scans.is_relative_to(config.runs_root) and len(list((scans / "train").glob("*.npz"))) == 6
     assert Path(made["report"]).is_relative_to(config.runs_root)
 
 
@@ -60,7 +71,7 @@ def test_every_test_frame_is_predicted_scored_and_some_are_meshed(job, tiny_outf
     clouds = {path.stem: read_points(path) for path in folder.glob("*.ply")}
     assert set(clouds) == set(tiny_outfit.frames("test"))
     assert all(len(cloud.points) == 12_000 for cloud in clouds.values())
-    meshes = [read_mesh(path) for path in (config.folder / "meshes" / "test" / "tiny").glob("*.*")]
+    meshes = [read_mesh(path) for path in (config.folder / "meshes" / "test" / "tiny").glob("[!.]*")]
     assert len(meshes) == 2 * 3
     assert all(1.2 < np.ptp(found.vertices[:, 1]) < 2 for found in meshes)
     rows = {(row["method"], row["metric"]): row["value"] for row in summary["metrics"]}
