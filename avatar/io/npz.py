@@ -144,14 +144,19 @@ def _match(key: str, array: np.ndarray, pattern: str, dims: dict[str, int]) -> d
     return dims
 
 
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], level: int = 9) -> None:
     """Writes an npz file whole or not at all; equal arrays give equal bytes, so that files can be hashed.
+
+    Args:
+        path: where to, ending in .npz.
+        arrays: what to write, by name.
+        level: of deflating, from 1 (fast) to 9 (small).
 
     Raises:
         AvatarError: for an array of Python objects.
     """
     packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for key, value in arrays.items():
             array = np.asarray(value)
             if array.dtype.hasobject:
@@ -160,7 +165,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
             np.lib.format.write_array(plain, array, allow_pickle=False)
             info = zipfile.ZipInfo(f"{key}.npy", ZIP_EPOCH)
             info.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(info, plain.getvalue(), compresslevel=9)
+            archive.writestr(info, plain.getvalue(), compresslevel=level)
     write_whole(path, packed.getvalue())
 
 

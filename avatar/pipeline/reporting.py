@@ -12,10 +12,10 @@ from avatar.data.outfits import Outfit
 from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent, write_report
 from avatar.evaluation.scores import Scores
 from avatar.evaluation.tables import View, metric_table, outfit_table
+from avatar.export.drawing import Camera, frame_camera
 from avatar.export.pictures import (
     color_bar,
     contact_sheet,
-    frame_camera,
     render_error,
     render_mesh,
     render_points,
@@ -102,7 +102,7 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
     scan = frame.scan
     camera = frame_camera(scan.points, "three_quarter")
     pictures: list[Picture | None] = [
-        Picture(render_points(PointCloud(scan.points, scan.normals), camera), f"scan of {name}"),
+        Picture(draw_cloud(PointCloud(scan.points, scan.normals, scan.colors), camera), f"scan of {name}"),
         None,
         None,
         None,
@@ -113,7 +113,7 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
         cloud = read_points(path)
         errors = cKDTree(scan.points).query(cloud.points, workers=-1)[0]
         hot = render_error(cloud, errors, MAX_ERROR, camera)
-        pictures[1] = Picture(render_points(cloud, camera), f"predicted points for {name}")
+        pictures[1] = Picture(draw_cloud(cloud, camera), f"predicted points for {name}")
         pictures[4] = Picture(
             np.concatenate([hot, color_bar(MAX_ERROR, hot.shape[0])], axis=1),
             f"distance of predicted points of {name} to the scan",
@@ -127,6 +127,11 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
     if mesh.is_file():
         pictures[3] = Picture(render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
     return PictureRow(f"{outfit.name}: {name}", tuple(pictures))
+
+
+def draw_cloud(cloud: PointCloud, camera: Camera) -> np.ndarray:
+    """A picture of points in their own colours, where they have some, or by their normals."""
+    return render_points(cloud, camera, "normals" if cloud.colors is None else cloud.colors)
 
 
 def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
