@@ -9,9 +9,12 @@ import pytest
 from PIL import Image
 from tiny import SETTINGS, quick_training
 
+from avatar.canonical.canonicalizer import CanonicalizerConfig
+from avatar.canonical.fields import SkinningFieldConfig
 from avatar.canonical.posed import DrawConfig
 from avatar.checks import AvatarError, DataError
 from avatar.data.scanner import ScanConfig
+from avatar.data.splits import split_outfit
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.io.meshes import read_mesh
@@ -42,7 +45,8 @@ def job(tiny_folder, tmp_path_factory) -> tuple[DemoConfig, dict]:
         runs_root=tmp_path_factory.mktemp("runs"),
         canonicalizer=CanonicalizeConfig(
             scan=ScanConfig(points=2000),
-            train=CycleConfig(first_steps=5, second_steps=5, draw=DrawConfig(pool=500), code_steps=2),
+            canonicalizer=CanonicalizerConfig(SkinningFieldConfig(width=16), SkinningFieldConfig(width=16, latent=4)),
+            train=CycleConfig(first_steps=5, second_steps=5, batch=2, draw=DrawConfig(pool=500), code_steps=2),
             pictures=1,
         ),
         train=train,
@@ -163,6 +167,20 @@ def test_runs_are_compared_in_one_table_with_their_floors(job, tmp_path):
     assert rows == {(row["method"], row["metric"]): row["value"] for row in summary["metrics"]}
     with pytest.raises(AvatarError, match=r"no scores below.*tools/evaluate\.py"):
         compare(replace(settings, runs_root=tmp_path))
+
+
+def test_frames_held_back_are_a_split_that_is_predicted_scored_and_compared(job, tiny_outfit, tmp_path):
+    config, _ = job
+    held = split_outfit(tiny_outfit, config.split).validation
+    (folder,) = predict(PredictConfig(run=config.folder, split="validation", points=2000))
+    assert folder.parent.name == "validation" and {path.stem for path in folder.glob("*.ply")} == set(held)
+    before = (config.folder / "scores.csv").read_bytes()
+    scores = evaluate(EvaluateConfig(runs=(config.folder,), split="validation", score=config.score, floors=False))
+    assert {row.frame for row in scores.frames} == set(held) and {row.variant for row in scores.rows} == {"validation"}
+    assert (config.folder / "scores.csv").read_bytes() == before
+    settings = CompareConfig(table="both", runs=(config.folder,), runs_root=config.runs_root, metrics=("cd_point",))
+    settings = replace(settings, splits=("test", "validation"), pictures=0, plots=False, out=tmp_path)
+    assert "| closet (validation) |" in compare(settings).read_text()
 
 
 def test_what_was_not_made_yet_is_named(job):

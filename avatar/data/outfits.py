@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from copy import copy
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Scan, Template
 
 SPLITS = ("train", "test")
+VALIDATION = "validation"  # training frames that a run held back: a split of `Outfit.with_validation`
 SAMPLE_FOLDER = Path(__file__).parents[1] / "assets" / "sample"
 OUTFIT_FORMAT = "outfit/1"
 
@@ -29,6 +32,7 @@ class Outfit(ABC):
     """
 
     def __init__(self, path: Path, dataset: str = ""):
+        self.held_back: tuple[str, ...] = ()
         self.path = Path(path)
         self.name = self.path.name
         self.dataset = dataset or self.path.parent.name
@@ -48,12 +52,27 @@ class Outfit(ABC):
         """Names of the frames of a split, sorted.
 
         Raises:
-            AvatarError: for a split other than train and test.
+            AvatarError: for a split other than train and test, and validation where frames are held back.
             DataError: when the split's folder is missing or empty.
         """
+        if split == VALIDATION and self.held_back:
+            return self.held_back
         if split not in SPLITS:
-            raise AvatarError(f"split: expected train or test, got {split!r}.")
+            held = ", or validation where frames were held back from training" if split == VALIDATION else ""
+            raise AvatarError(f"split: expected train or test{held}, got {split!r}.")
         return self._listed[split] or self._refuse_empty(split)
+
+    def with_validation(self, names: Sequence[str]) -> Self:
+        """The same outfit with some of its training frames as a split of their own, ``validation``, as well.
+
+        Raises:
+            AvatarError: for a frame that is not among those of training.
+        """
+        for name in names:
+            self.frame_path("train", name)
+        other = copy(self)
+        other.held_back = tuple(names)
+        return other
 
     def load(self, split: str, name: str) -> Frame:
         """One frame, checked: finite, in metres, scan over body.
@@ -70,10 +89,10 @@ class Outfit(ABC):
     def frame_path(self, split: str, name: str) -> Path:
         """The file of one of the outfit's frames. Raises `AvatarError` for a name that is not among them."""
         names = self.frames(split)
-        if name not in self._known[split]:
+        if name not in (names if split == VALIDATION else self._known[split]):
             near = difflib.get_close_matches(name, names, n=3) or names[:3]
             raise AvatarError(f"frame: {self.name} has no {split} frame {name!r}; there are {', '.join(near)}, ...")
-        return self.path / split / f"{name}.npz"
+        return self.path / ("train" if split == VALIDATION else split) / f"{name}.npz"
 
     def digest(self, split: str, name: str) -> str:
         """One hash over all of a frame on the disk: its file, and the files that the outfit's frames share."""

@@ -20,6 +20,7 @@ from avatar.evaluation.scores import Score, Scores, read_scores, write_scores
 from avatar.evaluation.tables import Table, View, outfit_table, to_latex, to_markdown
 from avatar.io.npz import write_whole
 from avatar.pipeline.pose_grid import draw_pose_grid
+from avatar.pipeline.scores import read_all_scores, scores_file
 
 
 @dataclass
@@ -41,7 +42,7 @@ class CompareConfig:
     canonicalizers: tuple[Path, ...] = ()  # folders of scored canonicalizers (tools/canonicalize.py scored=...)
     plots: bool = True
     pictures: int = 3  # unseen poses an outfit in the picture of all methods; 0 for none
-    split: str = "test"  # whose predictions are in the picture
+    splits: tuple[str, ...] = ("test",)  # that were scored; the first is the picture's
     data_root: Path | None = None  # where the data are now; where they were at training if null
     out: Path = Path("docs/results")
 
@@ -76,7 +77,7 @@ def compare(config: CompareConfig) -> Path:
     pictures = [*save_plots(config, scores.rows, runs)]
     if config.pictures:
         grid = file_of(config, "poses.png")
-        pictures += [grid] if draw_pose_grid(grid, runs, config.pictures, config.split, config.data_root) else []
+        pictures += [grid] if draw_pose_grid(grid, runs, config.pictures, config.splits[0], config.data_root) else []
     text = "\n".join([*map(to_markdown, tables), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
     write_whole(file_of(config, "md"), text.encode())
     write_whole(file_of(config, "tex"), "\n".join(map(to_latex, tables)).encode())
@@ -105,7 +106,7 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
     """
     scores, homes = Scores(), {}
     for run in runs:
-        mine = read_scores(run / "scores.csv")
+        mine = read_all_scores(scores_file(run, split) for split in config.splits)
         for row in mine.rows:
             homes.setdefault(row.outfit, set()).add(row.dataset or dataset_of(run))
         scores = scores + mine

@@ -14,7 +14,7 @@ from avatar.nn.closet import Skinning
 from avatar.pipeline.canonicalization import score_canonical_scans
 from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.methods import train
-from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
+from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict, scores_file
 from avatar.settings import settings_to_dict
 from avatar.training.canonicalizing import CanonicalizeConfig, canonicalize_frames, train_canonicalizer
 from avatar.training.distributed import current_team
@@ -88,15 +88,18 @@ def prepare_canonicalizer(config: ExperimentConfig, outfit: str) -> None:
 
 
 def score_run(config: ExperimentConfig, folder: Path) -> None:
-    """Predicts the test frames and scores them, unless the scores there are were made of the same."""
+    """Predicts the frames of each split and scores them, unless the scores there are were made of the same."""
     key = score_key(config, folder)
     stamp = folder / SCORED
-    if stamp.is_file() and stamp.read_text() == key and (folder / "scores.csv").is_file():
+    files = [scores_file(folder, split) for split in config.compare.splits]
+    if stamp.is_file() and stamp.read_text() == key and all(file.is_file() for file in files):
         return
     stamp.unlink(missing_ok=True)
-    where = {"data_root": config.data_root}
-    predict(PredictConfig(run=folder, points=config.points, surface=config.surface, device=config.device, **where))
-    evaluate(EvaluateConfig(runs=(folder,), score=config.score, **where))
+    made = {"points": config.points, "surface": config.surface, "device": config.device}
+    for split in config.compare.splits:
+        where = {"split": split, "data_root": config.data_root}
+        predict(PredictConfig(run=folder, **made, **where))
+        evaluate(EvaluateConfig(runs=(folder,), score=config.score, floors=split == "test", **where))
     write_whole(stamp, key.encode())
 
 

@@ -12,6 +12,7 @@ from avatar.checks import AvatarError
 from avatar.data.layouts import find_outfit
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
+from avatar.data.splits import split_outfit
 from avatar.evaluation.floors import score_body_floor, score_sampling_floor
 from avatar.evaluation.scores import Scores, read_scores, write_scores
 from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
@@ -31,7 +32,7 @@ class PredictConfig:
     """Posed point clouds from a trained run, for the frames of a split or for a motion file."""
 
     run: Path = Path("runs/closet/sample/dress/default")
-    split: str = "test"
+    split: str = "test"  # or validation, the training frames that the run held back, or train
     motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
     fps: float = 30.0  # frames a second a motion is resampled to
     points: int = 50000  # 1,000 to 400,000
@@ -46,7 +47,7 @@ class EvaluateConfig:
     """Scores of prediction folders, with the floors in the same table."""
 
     runs: tuple[Path, ...] = (Path("runs/closet/sample/dress/default"),)
-    split: str = "test"
+    split: str = "test"  # or validation, the training frames that the runs held back, or train
     floors: bool = True  # score the sampling floor and the bare body as well
     score: ScoreConfig = field(default_factory=ScoreConfig)
     data_root: Path | None = None  # where the data are now; where they were at training if null
@@ -68,8 +69,19 @@ def meshes_folder(run: Path, name: str, outfit: str) -> Path:
 
 
 def run_outfits(avatar: TrainedAvatar, data_root: Path | None) -> list[Outfit]:
-    """The outfits a run was trained on, where they are now or where they were then."""
-    return replace(avatar.config, data_root=data_root or avatar.config.data_root).outfits()
+    """The outfits a run was trained on, where they are now or then; what it held back is their validation split."""
+    outfits = replace(avatar.config, data_root=data_root or avatar.config.data_root).outfits()
+    return [
+        outfit.with_validation(split_outfit(outfit, avatar.config.split).validation)
+        if (outfit.path / "train").is_dir()
+        else outfit
+        for outfit in outfits
+    ]
+
+
+def scores_file(folder: Path, split: str) -> Path:
+    """Where a run's or a floor's scores on a split stand: ``scores.csv`` for test, ``scores.<split>.csv`` else."""
+    return folder / ("scores.csv" if split == "test" else f"scores.{split}.csv")
 
 
 def predict(config: PredictConfig) -> list[Path]:
@@ -106,7 +118,8 @@ def predict(config: PredictConfig) -> list[Path]:
 def evaluate(config: EvaluateConfig) -> Scores:
     """Scores runs, or a foreign program's predictions, beside their floors; prints the tables.
 
-    Each run's scores go to ``<run>/scores.csv``, the floors to ``<runs>/floors/<dataset>/<outfit>/scores.csv``.
+    Each run's scores go to ``<run>/scores.csv``, the floors to ``<runs>/floors/<dataset>/<outfit>/scores.csv``; those
+    on another split than test to ``scores.<split>.csv``.
     """
     if config.predictions is not None:
         outfit = find_outfit(config.data_root or Path("data"), config.dataset, config.outfit)
@@ -130,7 +143,7 @@ def score_runs(config: EvaluateConfig) -> Scores:
         settings = avatar.config
         label = Label(
             settings.method.variant,
-            variant=variant_of(settings),
+            variant=", ".join(part for part in (variant_of(settings), config.split) if part not in ("", "test")),
             seed=settings.train.seed,
             steps=avatar.steps,
             seconds=avatar.seconds,
@@ -145,9 +158,9 @@ def score_runs(config: EvaluateConfig) -> Scores:
             mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes, done)
             if config.floors and outfit.path not in seen:
                 seen.add(outfit.path)
-                path = floors_root(run, settings) / "floors" / settings.dataset / outfit.name / "scores.csv"
-                scores = scores + score_floors(outfit, config, mine.rows[-1].points, path)
-        write_scores(run / "scores.csv", mine)
+                path = floors_root(run, settings) / "floors" / settings.dataset / outfit.name
+                scores = scores + score_floors(outfit, config, mine.rows[-1].points, scores_file(path, config.split))
+        write_scores(scores_file(run, config.split), mine)
         scores = scores + mine
     return scores
 

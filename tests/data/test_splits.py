@@ -3,6 +3,7 @@
 from itertools import pairwise
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from avatar.checks import AvatarError
@@ -62,3 +63,18 @@ def test_bad_shares_are_refused():
             SplitConfig(**bad)
     with pytest.raises(AvatarError, match="frames left to train on"):
         split_frames(["a.1"], SplitConfig())
+
+
+def test_held_back_frames_are_a_split_of_their_own(tiny_outfit):
+    names = tiny_outfit.frames("train")[1::3]
+    outfit = tiny_outfit.with_validation(names)
+    assert outfit.frames("validation") == names and outfit.frames("train") == tiny_outfit.frames("train")
+    frame = outfit.load("validation", names[0])
+    assert frame.split == "validation" and np.array_equal(frame.scan.points, outfit.load("train", names[0]).scan.points)
+    assert outfit.digest("validation", names[0]) == outfit.digest("train", names[0])
+    with pytest.raises(AvatarError, match="no validation frame"):
+        outfit.load("validation", tiny_outfit.frames("train")[0])
+    with pytest.raises(AvatarError, match="no train frame"):
+        tiny_outfit.with_validation(("dance.00001",))
+    with pytest.raises(AvatarError, match="validation where frames were held back"):
+        tiny_outfit.frames("validation")
