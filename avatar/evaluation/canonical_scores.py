@@ -7,6 +7,7 @@ truth of its frame (`canonical_truth`), not a prediction with a scan.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -177,6 +178,7 @@ def _part_metrics(part: str) -> list[Metric]:
     ]
 
 
+OVERVIEW = ("cycle_cm", "cycle_garment_cm", "truth_garment_cm", "truth_contact_cm", "triangles_cut")
 CANONICAL_METRICS: dict[str, Metric] = {
     metric.name: metric
     for metric in (
@@ -215,7 +217,8 @@ def score_canonicalization(
     if not methods or not names:
         raise AvatarError(f"methods, names: expected at least one each, got {len(methods)} and {len(names)}.")
     first = next(iter(methods))
-    labels = [Label(TRUE, table=first.table, commit=first.commit), *methods]
+    shared = first.variant if len({label.variant for label in methods}) == 1 else ""
+    labels = [Label(TRUE, table=first.table, variant=shared, commit=first.commit), *methods]
     template = outfit.template
     surfaces = canonical_surfaces(outfit, split, names[0])
     frames: list[FrameScore] = []
@@ -306,6 +309,18 @@ def canonical_table(rows: Sequence[Score], outfit: str, metrics: Sequence[str] =
     )
     notes = (*(f"{m.name}: {m.definition}" for m in scored), TRUE_NOTE)
     return Table(outfit, "metric", tuple(methods), body, notes)
+
+
+def canonical_overview(rows: Sequence[Score], metrics: Sequence[str] = OVERVIEW) -> Table:
+    """A few canonicalization metrics of several outfits in one table, a line each, methods across as in
+    `canonical_table`.
+    """
+    outfits = list(dict.fromkeys(row.outfit for row in rows))
+    tables = [canonical_table(rows, outfit, metrics) for outfit in outfits]
+    body = tuple(
+        replace(line, label=f"{outfit}, {line.label}") for outfit, table in zip(outfits, tables) for line in table.rows
+    )
+    return replace(tables[0], title="", corner="outfit, metric", rows=body)
 
 
 TRUE_NOTE = (

@@ -68,7 +68,8 @@ def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> S
             learned = (source.steps, source.seconds) if isinstance(source, TrainedCanonicalizer) else (0, 0.0)
             methods[Label(kind.value, "canonical", split, 0, *learned, current_commit())] = carrier(config, source)
         found = score_canonicalization(outfit, split, names, methods)
-        tables.append(f"## {split}\n\n{to_markdown(canonical_table(found.rows, outfit.name))}")
+        plain = [replace(row, variant="") for row in found.rows]
+        tables.append(f"## {split}\n\n{to_markdown(canonical_table(plain, outfit.name))}")
         scores = scores + found
     write_scores(config.folder / "scores.csv", scores)
     text = "\n".join(tables)

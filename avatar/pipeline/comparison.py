@@ -10,7 +10,7 @@ import yaml
 
 from avatar.checks import AvatarError, DataError, check_name
 from avatar.evaluation.aggregate import FLOORS, method_key
-from avatar.evaluation.canonical_scores import canonical_table
+from avatar.evaluation.canonical_scores import canonical_overview, canonical_table
 from avatar.evaluation.curves import plot_fractions, plot_progress, plot_times
 from avatar.evaluation.differences import budget_table, compare_methods, difference_table, differences_csv
 from avatar.evaluation.forms import FormConfig, ReportedTable, form_table, reported_table
@@ -60,12 +60,25 @@ def compare(config: CompareConfig) -> Path:
     """Writes ``<out>/<table>.*``; gives the path of the Markdown.
 
     ``.csv`` and ``.frames.csv`` hold the tidy scores, ``.md`` and ``.tex`` the tables, ``.differences.csv`` those to
-    the baseline, ``.<plot>.png`` the plots, ``.poses.png`` the same unseen poses by all methods.
+    the baseline, ``.<plot>.png`` the plots, ``.poses.png`` the same unseen poses by all methods. Canonicalizers can be
+    compared alone; ``.canonical.csv`` holds their scores.
 
     Raises:
         AvatarError: when nothing was scored, or when outfits of one name in two data sets would share a row.
     """
-    runs = config.runs or tuple(named_runs(config))
+    tables, pictures = [], []
+    if config.runs or not config.canonicalizers:
+        tables, pictures = compare_runs(config, config.runs or tuple(named_runs(config)))
+    tables += canonical_tables(config)
+    text = "\n".join([*map(to_markdown, tables), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
+    write_whole(file_of(config, "md"), text.encode())
+    write_whole(file_of(config, "tex"), "\n".join(map(to_latex, tables)).encode())
+    print(text)
+    return file_of(config, "md")
+
+
+def compare_runs(config: CompareConfig, runs: tuple[Path, ...]) -> tuple[list[Table], list[Path]]:
+    """The tables of runs and their pictures, which are written, as are the scores."""
     scores = gather_scores(config, runs)
     write_scores(file_of(config, "csv"), scores)
     scores, shared = without_shared_variant(scores)
@@ -73,16 +86,11 @@ def compare(config: CompareConfig) -> Path:
     tables[0] = replace(tables[0], notes=(*tables[0].notes, *([f"All methods: {shared}."] if shared else [])))
     if config.reported is not None:
         tables.append(reported_table(config.reported))
-    tables += canonical_tables(config)
     pictures = [*save_plots(config, scores.rows, runs)]
     if config.pictures:
         grid = file_of(config, "poses.png")
         pictures += [grid] if draw_pose_grid(grid, runs, config.pictures, config.splits[0], config.data_root) else []
-    text = "\n".join([*map(to_markdown, tables), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
-    write_whole(file_of(config, "md"), text.encode())
-    write_whole(file_of(config, "tex"), "\n".join(map(to_latex, tables)).encode())
-    print(text)
-    return file_of(config, "md")
+    return tables, pictures
 
 
 def file_of(config: CompareConfig, suffix: str) -> Path:
@@ -178,15 +186,21 @@ def side_tables(config: CompareConfig, scores: Scores) -> list[Table]:
 
 
 def canonical_tables(config: CompareConfig) -> list[Table]:
-    """Canonical scans against their truth, a table an outfit and split."""
-    tables = []
-    for folder in config.canonicalizers:
-        rows = read_scores(folder / "scores.csv").rows
-        for split in dict.fromkeys(row.variant for row in rows if row.variant):
-            mine = [replace(row, variant="") for row in rows if row.variant in ("", split)]
-            table = canonical_table(mine, rows[0].outfit)
-            tables.append(replace(table, title=f"{table.title}: canonical scans of {split} frames"))
-    return tables
+    """Canonical scans against their truth: an overview a split where there are several outfits, a table an outfit."""
+    if not config.canonicalizers:
+        return []
+    scores = read_all_scores(folder / "scores.csv" for folder in config.canonicalizers)
+    write_scores(file_of(config, "canonical.csv"), scores)
+    rows = scores.rows
+    tables, single = [], []
+    for split in dict.fromkeys(row.variant for row in rows if row.variant):
+        title = f"canonical scans of {split} frames"
+        mine = [replace(row, variant="") for row in rows if row.variant == split]
+        outfits = list(dict.fromkeys(row.outfit for row in mine))
+        if len(outfits) > 1:
+            tables.append(replace(canonical_overview(mine), title=title))
+        single += [replace(canonical_table(mine, outfit), title=f"{outfit}: {title}") for outfit in outfits]
+    return tables + single
 
 
 def save_plots(config: CompareConfig, rows: list[Score], runs: tuple[Path, ...]) -> Iterator[Path]:

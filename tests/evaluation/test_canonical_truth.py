@@ -16,6 +16,7 @@ from avatar.evaluation.canonical_scores import (
     CANONICAL_METRICS,
     TRUE,
     CanonicalComparison,
+    canonical_overview,
     canonical_surfaces,
     canonical_table,
     score_canonicalization,
@@ -262,6 +263,29 @@ def test_an_outfit_is_scored_with_the_references_beside(scored):
     assert means[TRUE, "weights"].value == 0
     assert means["lifted", "surface_cm"].value > means[TRUE, "surface_cm"].value + 1
     assert (TRUE, "triangles_cut") not in means  # scans of points
+
+
+def test_true_weights_stand_beside_methods_of_one_variant(tiny_folder):
+    outfit = OpenOutfit(tiny_folder, "open", ScanConfig(points=300))
+
+    def truly(frame):
+        return carry_truly(frame, frame_truth(frame.scan, outfit.template), outfit.template)
+
+    rows = []
+    for split in ("train", "test"):
+        rows += score_canonicalization(outfit, split, outfit.frames(split)[:1], {Label("m", variant=split): truly}).rows
+    places = {(row.method, row.variant, row.metric) for row in rows}
+    assert len(places) == len(rows) and {variant for _, variant, _ in places} == {"train", "test"}
+
+
+def test_several_outfits_stand_in_one_overview(scored):
+    scores, _ = scored
+    other = [replace(row, outfit="robe") for row in scores.rows]
+    table = canonical_overview(scores.rows + other)
+    labels = [row.label for row in table.rows]
+    assert labels[0] == "tiny, cycle_cm (cm)" and len([x for x in labels if x.startswith("robe, ")]) == len(labels) / 2
+    single = canonical_table(scores.rows, "tiny")
+    assert {r.label: r.values for r in single.rows}["cycle_cm (cm)"] == table.rows[0].values
 
 
 def test_scores_are_kept_and_tabled(scored, tmp_path):
