@@ -60,7 +60,7 @@ def compare(config: CompareConfig) -> Path:
     """Writes ``<out>/<table>.*``; gives the path of the Markdown.
 
     ``.csv`` and ``.frames.csv`` hold the tidy scores, ``.md`` and ``.tex`` the tables, ``.differences.csv`` those to
-    the baseline, ``.<plot>.png`` the plots, ``.poses.png`` the same unseen poses by all methods. Canonicalizers can be
+    the baseline, ``.<plot>.png`` the plots, ``.poses.jpg`` the same unseen poses by all methods. Canonicalizers can be
     compared alone; ``.canonical.csv`` holds their scores.
 
     Raises:
@@ -88,7 +88,7 @@ def compare_runs(config: CompareConfig, runs: tuple[Path, ...]) -> tuple[list[Ta
         tables.append(reported_table(config.reported))
     pictures = [*save_plots(config, scores.rows, runs)]
     if config.pictures:
-        grid = file_of(config, "poses.png")
+        grid = file_of(config, "poses.jpg")
         pictures += [grid] if draw_pose_grid(grid, runs, config.pictures, config.splits[0], config.data_root) else []
     return tables, pictures
 

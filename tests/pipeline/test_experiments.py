@@ -107,7 +107,7 @@ def test_the_table_has_every_form(jobs):
     assert {row.table for row in rows} == {"small"}
     expected = sum(len(read_scores(job.run.folder / "scores.csv").rows) for job in jobs)
     assert len([row for row in rows if row.method in ("static", "closet")]) == expected
-    sheet = np.asarray(Image.open(out / "small.poses.png"))
+    sheet = np.asarray(Image.open(out / "small.poses.jpg"))
     assert 2 * 600 < sheet.shape[0] < 3 * 600 and 4 * 400 < sheet.shape[1] < 5 * 400  # two poses, three methods, truth
 
 
@@ -119,7 +119,7 @@ def test_scores_of_a_foreign_program_stand_in_the_same_table(jobs, tmp_path, tin
     config = replace(jobs[0].compare, runs=(jobs[0].run.folder, theirs), runs_root=jobs[0].runs_root, out=tmp_path)
     text = compare(replace(config, data_root=tiny_folder.parents[1], plots=False)).read_text()
     assert "| metric | sampling | body | static | theirs |" in text
-    assert np.asarray(Image.open(tmp_path / "small.poses.png")).shape[1] > 3 * 400
+    assert np.asarray(Image.open(tmp_path / "small.poses.jpg")).shape[1] > 3 * 400
 
 
 def test_outfits_of_one_name_in_two_data_sets_are_refused(jobs, tmp_path):
