@@ -71,9 +71,9 @@ def find_baseline(method: str, methods: Sequence[str], baseline: str) -> str | N
 
 
 def _shared_outfits(frames: Sequence, first: str, second: str) -> list[str]:
-    """Outfits on which both methods were scored."""
-    seen = {key: {row.outfit for row in frames if method_key(row) == key} for key in (first, second)}
-    return sorted(seen[first] & seen[second])
+    """Outfits of which both methods were scored on a frame; another split's frames are none of test's."""
+    seen = {key: {(row.outfit, row.frame) for row in frames if method_key(row) == key} for key in (first, second)}
+    return sorted({outfit for outfit, _ in seen[first] & seen[second]})
 
 
 def difference_table(found: Sequence[Difference], metric: str) -> Table:

@@ -157,7 +157,7 @@ def main_tables(config: CompareConfig, rows: list[Score]) -> list[Table]:
     if config.form is not None:
         tables = [form_table(rows, metrics, config.form, config.table)]
         distances = [name for name in metrics if name.startswith("cd_")]
-        if distances and any(row.method == "sampling" for row in rows):
+        if distances and len(config.splits) == 1 and any(row.method == "sampling" for row in rows):
             title = f"{config.table}, excess over the sampling floor"
             tables.append(form_table(rows, distances, config.form, title, excess=True))
         return tables

@@ -1,6 +1,7 @@
 """Differences to a baseline: paired values, the right baseline, all outfits together; and what training cost."""
 
 import csv
+from dataclasses import replace
 
 import pytest
 
@@ -22,6 +23,8 @@ def test_differences_are_paired_by_frame_for_each_outfit_and_for_all():
     scores = Scores([], frames("pop", "tee", [1, 2, 3]) + frames("csf", "tee", [2, 3, 4]))
     scores = scores + Scores([], frames("pop", "dress", [9]) + frames("csf", "dress", [4]))
     scores = scores + Scores([], frames("csf", "shirt", [7]))  # pop has no shirt: nothing to pair
+    held_back = [replace(f, frame="random.00001", variant="validation") for f in frames("csf", "tee", [2])]
+    scores = scores + Scores([], held_back)  # frames of another split: nothing to pair either
     scores = scores + Scores([], frames("sampling", "tee", [0, 0, 0]) + frames("body", "tee", [5, 6, 7]))
     found = {(d.outfit, d.method): d.interval for d in compare_methods(scores, "cd_point", "pop")}
     assert set(found) == {("tee", "body"), ("tee", "csf"), ("dress", "csf"), (ALL, "csf")}
