@@ -154,3 +154,9 @@ def test_a_multirun_goes_on_after_a_failure_and_names_it(tmp_path):
     assert result.returncode == 2
     assert "2 failed" in result.stderr
     assert f"run={tmp_path}/one" in result.stderr and f"run={tmp_path}/two" in result.stderr
+
+
+def test_a_run_takes_any_canonicalizer_by_name():
+    """A group of the same name would take the option for a choice among its files."""
+    assert load("train", "canonical=mine").canonical == "mine"
+    assert load("experiment", "canonical=mine", "experiment=loose").canonical == "mine"

@@ -24,7 +24,7 @@ JOB = Job(True, "cpu", AVATARS, {})
 
 def run_quick(out, *only: str, **options):
     """A quick benchmark; gives its rows."""
-    canonicalizers = {"small": yaml.safe_load((CONF / "canonical" / "small.yaml").read_text())}
+    canonicalizers = {"small": yaml.safe_load((CONF / "canonicalizer_size" / "small.yaml").read_text())}
     options = {"quick": True, "memory": False, "repeats": 2, "avatars": AVATARS} | options
     bench(BenchConfig(only=only, out=out, canonicalizers=canonicalizers, **options))
     return read_scores(out / "bench.csv").rows
