@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -55,7 +57,8 @@ def nearest_both_ways(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
     """What `nearest` gives for points in others and for others in points, faster on the CPU.
 
     A tree keeps its points in an order in which neighbours follow each other; asked about in that order, the other
-    tree's branches stay in the processor's cache. Among points at the same distance another may come.
+    tree's branches stay in the processor's cache. Clouds are shared out among threads whole, so trees are built side by
+    side, too. Among points at the same distance another may come.
 
     Args:
         points: ``(B, N, 3)``; others: ``(B, M, 3)``.
@@ -70,12 +73,11 @@ def nearest_both_ways(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
     check_shape("others", others, "B M 3", B=dims["B"])
     if points.is_cuda or not (points.shape[1] and others.shape[1]):
         return nearest(points, others), nearest(others, points)
-    there, back = (torch.empty(cloud.shape[:2], dtype=torch.long) for cloud in (points, others))
-    for row, clouds in enumerate(zip(points.double().numpy(), others.double().numpy())):
-        tree, other = map(_build_tree, clouds)
-        there[row, tree.indices] = _ask(other, tree.data[tree.indices])[:, 0]
-        back[row, other.indices] = _ask(tree, other.data[other.indices])[:, 0]
-    return there, back
+    clouds = [cloud.double().numpy() for batch in (points, others) for cloud in batch]
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # scipy lets go of Python's lock
+        trees = list(pool.map(_build_tree, clouds))
+        found = list(pool.map(_ask_in_order, trees, trees[len(points) :] + trees[: len(points)]))
+    return torch.stack(found[: len(points)]), torch.stack(found[len(points) :])
 
 
 def _build_tree(cloud: np.ndarray) -> cKDTree:
@@ -86,13 +88,20 @@ def _build_tree(cloud: np.ndarray) -> cKDTree:
         raise AvatarError(f"points: expected finite coordinates ({error}).") from error
 
 
-def _ask(tree: cKDTree, queries: np.ndarray, k: int = 1) -> Tensor:
+def _ask(tree: cKDTree, queries: np.ndarray, k: int) -> Tensor:
     """Indices ``(N, k)`` of the nearest points of a tree to finite queries."""
     try:
         _, ids = tree.query(queries, k=k, workers=torch.get_num_threads())
     except ValueError as error:
         raise AvatarError(f"queries: expected finite coordinates ({error}).") from error
     return torch.from_numpy(ids).reshape(len(queries), k).long()
+
+
+def _ask_in_order(tree: cKDTree, other: cKDTree) -> Tensor:
+    """Indices ``(N,)`` of the nearest points of the other tree to this tree's points, asked in this tree's order."""
+    ids = torch.empty(tree.n, dtype=torch.long)
+    ids[tree.indices] = torch.from_numpy(other.query(tree.data[tree.indices])[1])
+    return ids
 
 
 def _k_nearest_chunked(queries: Tensor, points: Tensor, k: int) -> Tensor:

@@ -43,6 +43,7 @@ RACES: dict[str, Callable[[Job], list[Race]]] = {
 }
 OTHERS: dict[str, Callable[[Job, int], list[Figure]]] = {"growth": growth_figures, "ceilings": ceiling_figures}
 PACKAGES = ("torch", "numpy", "scipy", "open3d-cpu", "open3d", "newton")
+WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")  # how idle threads wait (avatar.environment)
 report = logging.getLogger(__name__)
 
 
@@ -124,9 +125,10 @@ def describe_machine() -> dict[str, str]:
     if info.is_file():
         named = [line for line in info.read_text().splitlines() if line.startswith("model name")]
         cpu = named[0].partition(":")[2].strip() if named else cpu
+    waiting = ", ".join(f"{name}={os.environ[name]}" for name in WAITING if name in os.environ)
     facts = {
         "processor": f"{cpu}, {os.cpu_count()} cores",
-        "threads": f"{torch.get_num_threads()}, idle ones {os.environ.get('OMP_WAIT_POLICY', 'as OpenMP likes')}",
+        "threads": f"{torch.get_num_threads()}, {waiting or 'idle ones as OpenMP likes'}",
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "system": f"{platform.system()}, Python {platform.python_version()}",
     }
