@@ -40,11 +40,15 @@ ONLY_IN = {  # package: the rooms that may name it at all
     "open3d": {"export"},
     "newton": {"simulate"},
     "warp": {"simulate"},
+    "triton": {"geometry"},
     "anny": {"body"},
     "smplx": set(),
 }
-LAZY = {*ONLY_IN, "pyvista", "pygltflib", "pxr", "matplotlib", "skimage", "tensorboard"}
-KERNELS = {"avatar.simulate.kernels": "warp"}  # decorators need it at the top; itself imported inside functions only
+LAZY = {*ONLY_IN, "pyvista", "pygltflib", "pxr", "matplotlib", "skimage", "tensorboard"} - {"triton"}  # torch loads it
+KERNELS = {
+    "avatar.simulate.kernels": "warp",
+    "avatar.geometry.kernels": "triton",
+}  # decorators need it at the top; itself imported inside functions only
 IMPORTERS = ("require", "import_module", "__import__")
 RESTRICTED = PACKAGE / "body" / "inert_pickle.py"
 

@@ -1,8 +1,11 @@
-"""Exact nearest neighbours: KD-trees on the CPU, chunked search on CUDA. Indices only; distances stay in torch."""
+"""Exact nearest neighbours: KD-trees on the CPU, brute force on CUDA. Indices only; distances stay in torch."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 import numpy as np
 import torch
@@ -12,7 +15,8 @@ from torch import Tensor
 from avatar.checks import AvatarError, check_shape
 
 LEAF = 32  # points in a leaf of the trees; on surfaces a little faster than scipy's 10 or 16
-CUDA_CHUNK_PAIRS = 1 << 27  # distances held at once by the CUDA search: 512 MiB in float32
+CUDA_CHUNK_PAIRS = 1 << 27  # distances held at once by the chunked CUDA search: 512 MiB in float32
+report = logging.getLogger(__name__)
 
 
 def nearest(queries: Tensor, points: Tensor) -> Tensor:
@@ -46,6 +50,9 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
     if not 1 <= k <= dims["M"]:
         raise AvatarError(f"k, points: expected k of at least 1 and k={k} points or more, got {dims['M']} points.")
     if queries.is_cuda:
+        fused = fused_search() if k == 1 and torch.float64 not in (queries.dtype, points.dtype) else None
+        if fused:
+            return fused(queries.float(), points.float()).unsqueeze(-1)
         return torch.stack([_k_nearest_chunked(q, p, k) for q, p in zip(queries, points)])
     pairs = zip(queries.double().cpu().numpy(), points.double().cpu().numpy())
     found = [_ask(_build_tree(cloud), query, k) for query, cloud in pairs]
@@ -78,6 +85,22 @@ def nearest_both_ways(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         trees = list(pool.map(_build_tree, clouds))
         found = list(pool.map(_ask_in_order, trees, trees[len(points) :] + trees[: len(points)]))
     return torch.stack(found[: len(points)]), torch.stack(found[len(points) :])
+
+
+@cache
+def fused_search() -> Callable[[Tensor, Tensor], Tensor] | None:
+    """`kernels.nearest_fused`, tried once on the current device; None, with a warning, where Triton cannot run it.
+
+    CUDA builds of torch bring Triton along, but it needs a C compiler, too.
+    """
+    try:
+        from avatar.geometry.kernels import nearest_fused
+
+        nearest_fused(torch.zeros(1, 1, 3, device="cuda"), torch.zeros(1, 1, 3, device="cuda"))
+    except Exception as error:  # whatever a compiler says: it is only slower without
+        report.warning("Nearest neighbours on CUDA go the slow way, for Triton does not work here: %s", error)
+        return None
+    return nearest_fused
 
 
 def _build_tree(cloud: np.ndarray) -> cKDTree:

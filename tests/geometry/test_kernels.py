@@ -1,0 +1,80 @@
+"""The CUDA search without CUDA: Triton interprets it, and compiles it for devices that are not there."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from avatar.geometry.neighbours import fused_search, k_nearest, nearest
+
+ROOT = Path(__file__).parents[2]
+
+INTERPRETED = """
+import torch
+from avatar.geometry.kernels import nearest_fused
+torch.manual_seed(0)
+for frames, count, others in ((2, 70, 150), (1, 1, 1), (3, 32, 64), (1, 33, 65)):
+    q, p = torch.randn(frames, count, 3), torch.randn(frames, others, 3)
+    q, p = q + 100, p + 100  # where the expanded product form is wrong
+    ids = nearest_fused(q, p)
+    apart = torch.cdist(q.double(), p.double())
+    got, best = apart.gather(-1, ids[..., None])[..., 0], apart.amin(-1)
+    assert ids.dtype == torch.long and torch.allclose(got, best, rtol=1e-6), (got - best).abs().max()
+q[0, 1, 2], p[0, 5, 0], far = torch.nan, torch.nan, torch.full((1, 1, 3), torch.inf)
+ids = nearest_fused(q, p)
+assert ids.min() >= 0 and ids.max() < p.shape[1] and not (ids == 5).any()
+assert torch.equal(ids[0, 2:], nearest_fused(q[:, 2:], p)[0])  # the others do not care
+assert nearest_fused(far, p).item() in range(p.shape[1])
+print("agrees")
+"""
+
+COMPILED = """
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from avatar.geometry.kernels import POINTS, QUERIES, search
+kinds = dict(queries="*fp32", points="*fp32", found="*i64", n="i32", m="i32", QUERIES="constexpr", POINTS="constexpr")
+source = ASTSource(search, kinds, {"QUERIES": QUERIES, "POINTS": POINTS})
+for capability in (80, 90):
+    binary = triton.compile(source, target=GPUTarget("cuda", capability, 32)).asm
+    assert binary["cubin"] and "st.global" in binary["ptx"]
+print("compiles")
+"""
+
+
+def in_fresh_python(code: str, folder: Path, **variables: str) -> subprocess.CompletedProcess:
+    """Whether a kernel is interpreted is settled when Triton is imported."""
+    told = os.environ | {"TRITON_CACHE_DIR": str(folder), "PYTHONPATH": str(ROOT)} | variables
+    script = folder / "script.py"  # a file, for Triton reads the sources of what it compiles
+    script.write_text(code)
+    return subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=told, check=False)
+
+
+def test_interpreted_search_agrees_with_all_distances(tmp_path):
+    done = in_fresh_python(INTERPRETED, tmp_path, TRITON_INTERPRET="1")
+    assert done.stdout.strip() == "agrees", done.stderr
+
+
+def test_search_compiles_for_devices_that_are_not_here(tmp_path):
+    done = in_fresh_python(COMPILED, tmp_path)
+    assert done.stdout.strip() == "compiles", done.stderr
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="what happens without CUDA")
+def test_where_it_cannot_run_the_slow_way_is_taken_with_a_warning(caplog):
+    fused_search.cache_clear()
+    assert fused_search() is None and "slow way" in caplog.text
+    fused_search.cache_clear()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_search_on_cuda_agrees_with_the_trees():
+    q, p = torch.randn(2, 5000, 3), torch.randn(2, 4000, 3)
+    assert fused_search() is not None
+    ids = nearest(q.cuda(), p.cuda()).cpu()
+    apart = [(q - p.gather(1, i[..., None].expand(-1, -1, 3))).norm(dim=-1) for i in (ids, k_nearest(q, p, 1)[..., 0])]
+    torch.testing.assert_close(*apart)
