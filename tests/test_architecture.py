@@ -44,11 +44,9 @@ ONLY_IN = {  # package: the rooms that may name it at all
     "anny": {"body"},
     "smplx": set(),
 }
-LAZY = {*ONLY_IN, "pyvista", "pygltflib", "pxr", "matplotlib", "skimage", "tensorboard"} - {"triton"}  # torch loads it
-KERNELS = {
-    "avatar.simulate.kernels": "warp",
-    "avatar.geometry.kernels": "triton",
-}  # decorators need it at the top; itself imported inside functions only
+# Triton is not among them, for torch loads it where it is installed.
+LAZY = {*ONLY_IN, "roma", "pyvista", "pygltflib", "pxr", "matplotlib", "skimage", "tensorboard"} - {"triton"}
+KERNELS = {"avatar.simulate.kernels": "warp"}  # decorators need it at the top; itself imported inside functions only
 IMPORTERS = ("require", "import_module", "__import__")
 RESTRICTED = PACKAGE / "body" / "inert_pickle.py"
 

@@ -15,6 +15,16 @@ def check_parents(parents: tuple[int, ...]) -> None:
         raise AvatarError(f"parents: expected -1 first and every parent before its child, got {tuple(parents)}.")
 
 
+def tree_distances(parents: tuple[int, ...]) -> Tensor:
+    """Edges between any two joints of a kinematic tree: ``(J, J)`` int64."""
+    check_parents(parents)
+    distances = torch.zeros(len(parents), len(parents), dtype=torch.long)
+    for joint, parent in enumerate(parents[1:], start=1):
+        distances[joint, :joint] = distances[parent, :joint] + 1
+        distances[:joint, joint] = distances[joint, :joint]
+    return distances
+
+
 def chain_transforms(pose: Tensor, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
     """Rigid motion of each joint's bone from rest to a pose, along the kinematic tree.
 

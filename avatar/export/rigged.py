@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 
 from avatar.body.model import BodyModel
@@ -139,6 +138,8 @@ def _add_motion(gltf: Any, document: Any, buffer: _Buffer, body: BodyModel, moti
     check_finite("motion.translations", motion.translations)
     if not dims["T"] or not 0 < motion.fps <= 1000:
         raise AvatarError(f"motion: expected frames and fps in (0, 1000], got {dims['T']} at {motion.fps}.")
+    import roma
+
     quaternions = roma.rotvec_to_unitquat(torch.as_tensor(motion.poses, dtype=torch.float64)).numpy()
     signs = np.sign(np.einsum("tjc,tjc->tj", quaternions[1:], quaternions[:-1]))
     signs = np.cumprod(np.where(signs < 0, -1, 1), axis=0)  # neighbours on one side, for the short way between

@@ -1,8 +1,12 @@
-"""Rigid and affine transforms as (..., 4, 4) matrices, named destination_from_source."""
+"""Rigid and affine transforms as (..., 4, 4) matrices, named destination_from_source.
+
+RoMa is imported where it is used: it loads torch's compiler, 1.5 s in which most commands do without rotations.
+"""
 
 from __future__ import annotations
 
-import roma
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -11,14 +15,38 @@ from avatar.checks import AvatarError, check_shape
 
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
     """Rotation matrices of axis-angle vectors. ``(..., 3)`` radians to ``(..., 3, 3)``; smooth at zero."""
+    import roma
+
     check_shape("axis_angle", axis_angle, "... 3")
     return roma.rotvec_to_rotmat(axis_angle)
 
 
 def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
     """Axis-angle vectors of rotation matrices. ``(..., 3, 3)`` to ``(..., 3)`` radians, angles in [0, pi]."""
+    import roma
+
     check_shape("rotation", rotation, "... 3 3")
     return roma.rotmat_to_rotvec(rotation)
+
+
+def relative_quaternions(joint_transforms: Tensor, parents: Sequence[int]) -> Tensor:
+    """Each joint's turn against its parent, but the root's, as the unit quaternion (x, y, z, w) with w of at least 0.
+
+    Needs no pose parameters and does not change with the body's place and heading.
+
+    Args:
+        joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
+        parents: J indices, -1 for the root.
+
+    Returns:
+        ``(B, J - 1, 4)``.
+    """
+    import roma
+
+    check_shape("joint_transforms", joint_transforms, "B J 4 4", J=len(parents))
+    rotations = joint_transforms[..., :3, :3]
+    quaternions = roma.rotmat_to_unitquat(rotations[:, list(parents[1:])].transpose(-1, -2) @ rotations[:, 1:])
+    return torch.where(quaternions[..., 3:] < 0, -quaternions, quaternions)
 
 
 def assemble_transform(linear: Tensor, shift: Tensor) -> Tensor:

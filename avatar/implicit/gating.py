@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from enum import Enum
 
-import roma
 import torch
 from torch import Tensor, nn
 
-from avatar.body.skinning import check_parents
+from avatar.body.skinning import tree_distances
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.transforms import relative_quaternions
 
 
 class Attention(Enum):
@@ -17,16 +17,6 @@ class Attention(Enum):
 
     neighbours = "neighbours"  # up and down the tree: the paper
     ancestors = "ancestors"  # up the tree alone: the paper's code
-
-
-def tree_distances(parents: tuple[int, ...]) -> Tensor:
-    """Edges between any two joints of a kinematic tree: ``(J, J)`` int64."""
-    check_parents(parents)
-    distances = torch.zeros(len(parents), len(parents), dtype=torch.long)
-    for joint, parent in enumerate(parents[1:], start=1):
-        distances[joint, :joint] = distances[parent, :joint] + 1
-        distances[:joint, joint] = distances[joint, :joint]
-    return distances
 
 
 def attention_map(parents: tuple[int, ...], rings: int, attention: Attention, normalised: bool) -> Tensor:
@@ -54,23 +44,8 @@ def attention_map(parents: tuple[int, ...], rings: int, attention: Attention, no
 
 
 def joint_quaternions(joint_transforms: Tensor, parents: tuple[int, ...]) -> Tensor:
-    """Rotation of each joint against its parent, since the canonical pose, as unit quaternions (w, x, y, z), w >= 0.
-
-    Taken from the transforms, so data without pose parameters serve as well. The root is left out: turning or moving
-    the whole person changes nothing.
-
-    Args:
-        joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
-        parents: the kinematic tree.
-
-    Returns:
-        ``(B, J - 1, 4)``.
-    """
-    check_shape("joint_transforms", joint_transforms, "B J 4 4", J=len(parents))
-    rotations = joint_transforms[..., :3, :3]
-    above = rotations[:, list(parents[1:])]
-    quaternions = roma.rotmat_to_unitquat(above.transpose(-1, -2) @ rotations[:, 1:]).roll(1, dims=-1)
-    return torch.where(quaternions[..., :1] < 0, -quaternions, quaternions)
+    """`relative_quaternions` in the order (w, x, y, z), ``(B, J, 4, 4)`` to ``(B, J - 1, 4)``."""
+    return relative_quaternions(joint_transforms, parents).roll(1, dims=-1)
 
 
 class PoseGate(nn.Module):

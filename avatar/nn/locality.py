@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import roma
 import torch
 from torch import Tensor, nn
 
-from avatar.checks import AvatarError, check_shape
+from avatar.body.skinning import tree_distances
+from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate
+from avatar.geometry.transforms import relative_quaternions
 from avatar.nn.pointnet2 import PointNorm, point_mlp
 from avatar.records import SurfaceSamples, Template
 
@@ -35,16 +36,6 @@ class LocalPoseConfig:
             )
 
 
-def tree_distances(parents: tuple[int, ...]) -> Tensor:
-    """Steps between each two joints along the kinematic tree, ``(J, J)`` int64."""
-    steps = torch.full((len(parents), len(parents)), len(parents))
-    for joint, parent in enumerate(parents):
-        if joint:  # as far from what is already there as its parent, and one more
-            steps[joint, :joint] = steps[:joint, joint] = steps[parent, :joint] + 1
-        steps[joint, joint] = 0
-    return steps
-
-
 def pose_gates(template: Template, rings: int) -> Tensor:
     """How much each vertex sees of each joint but the root, ``(V, J - 1)`` in [0, 1]: SCANimate's W w (eq. 18).
 
@@ -55,23 +46,8 @@ def pose_gates(template: Template, rings: int) -> Tensor:
 
 
 def relative_rotations(joint_transforms: Tensor, parents: tuple[int, ...]) -> Tensor:
-    """Rotation of each joint but the root relative to its parent, as a quaternion less that of rest.
-
-    Needs no pose parameters and does not change with the body's place and heading. Of the two quaternions of a
-    rotation it is the one with a positive real part (x, y, z, w - 1), so that the canonical pose is all zeros.
-
-    Args:
-        joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
-        parents: J indices, -1 for the root.
-
-    Returns:
-        ``(B, J - 1, 4)``.
-    """
-    check_shape("joint_transforms", joint_transforms, "B J 4 4", J=len(parents))
-    rotations = joint_transforms[..., :3, :3]
-    relative = rotations[:, list(parents[1:])].transpose(-1, -2) @ rotations[:, 1:]
-    quaternions = roma.rotmat_to_unitquat(relative)
-    quaternions = torch.where(quaternions[..., 3:] < 0, -quaternions, quaternions)
+    """`relative_quaternions` less that of rest, (x, y, z, w - 1), so that the canonical pose is all zeros."""
+    quaternions = relative_quaternions(joint_transforms, parents)
     return quaternions - quaternions.new_tensor([0.0, 0.0, 0.0, 1.0])
 
 

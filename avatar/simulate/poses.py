@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from scipy.stats import qmc
 
 from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.body.open import open_body, open_body_shapes
@@ -34,6 +33,8 @@ def random_angles(count: int, seed: int) -> Angles:
     knees share a squat, a stride and a lifted leg, and with a thigh up the trunk bends less; arms share how far
     they are raised, and elbows fold as arms come forward.
     """
+    from scipy.stats import qmc  # here, for it takes half a second to load
+
     factors = qmc.Sobol(27, scramble=True, rng=np.random.default_rng(seed)).random(count).T
     unit = iter(factors)
     signed = (2 * factor - 1 for factor in unit)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from bodies import random_bind, random_pose
 
+from avatar.body.model import SMPL_PARENTS
 from avatar.body.open import open_body
 from avatar.body.skinning import (
     blend_transforms,
@@ -11,6 +12,7 @@ from avatar.body.skinning import (
     check_parents,
     pose_points,
     skin_transforms,
+    tree_distances,
     unpose_points,
 )
 from avatar.checks import AvatarError
@@ -79,3 +81,23 @@ def test_skinning_with_the_body_s_own_weights_is_the_body_s_own():
     torch.testing.assert_close(transform_points(found, template.vertices), posed.vertices, atol=2e-6, rtol=0)
     plain = skin_transforms(template.weights, posed.joint_transforms)
     assert (transform_points(plain, template.vertices) - posed.vertices).norm(dim=-1).max() > 2e-3
+
+
+def search(parents: tuple[int, ...], start: int) -> list[int]:
+    """Edges from one joint to all others, by walking the tree."""
+    neighbours = {j: [p] if p >= 0 else [] for j, p in enumerate(parents)}
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            neighbours[parent].append(joint)
+    found, edge = {start: 0}, [start]
+    while edge:
+        edge = [
+            n for joint in edge for n in neighbours[joint] if n not in found and not found.update({n: found[joint] + 1})
+        ]
+    return [found[joint] for joint in range(len(parents))]
+
+
+@pytest.mark.parametrize("parents", [(-1, 0, 1, 2), (-1, 0, 1, 0, 3), SMPL_PARENTS, (-1,)])
+def test_tree_distances_are_those_of_a_search(parents):
+    expected = [search(parents, joint) for joint in range(len(parents))]
+    assert tree_distances(parents).tolist() == expected

@@ -9,30 +9,10 @@ from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.geometry.transforms import assemble_transform
-from avatar.implicit.gating import Attention, PoseGate, attention_map, joint_quaternions, tree_distances
+from avatar.implicit.gating import Attention, PoseGate, attention_map, joint_quaternions
 
 CHAIN = (-1, 0, 1, 2, 3, 4)  # a snake
 FORK = (-1, 0, 1, 0, 3)  # two arms of two joints
-
-
-def search(parents: tuple[int, ...], start: int) -> list[int]:
-    """Edges from one joint to all others, by walking the tree."""
-    neighbours = {j: [p] if p >= 0 else [] for j, p in enumerate(parents)}
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            neighbours[parent].append(joint)
-    found, edge = {start: 0}, [start]
-    while edge:
-        edge = [
-            n for joint in edge for n in neighbours[joint] if n not in found and not found.update({n: found[joint] + 1})
-        ]
-    return [found[joint] for joint in range(len(parents))]
-
-
-@pytest.mark.parametrize("parents", [CHAIN, FORK, SMPL_PARENTS, (-1,)])
-def test_tree_distances_are_those_of_a_search(parents):
-    expected = [search(parents, joint) for joint in range(len(parents))]
-    assert tree_distances(parents).tolist() == expected
 
 
 def test_neighbours_attend_both_ways_and_ancestors_up_alone():

@@ -15,7 +15,6 @@ from avatar.nn.locality import (
     fourier_features,
     pose_gates,
     relative_rotations,
-    tree_distances,
 )
 from avatar.records import SurfaceSamples
 
@@ -40,11 +39,6 @@ def steps_between(one: int, other: int) -> int:
             line.append(SMPL_PARENTS[line[-1]])
         lines.append(line)
     return min(lines[0].index(joint) + lines[1].index(joint) for joint in lines[0] if joint in lines[1])
-
-
-def test_distances_are_those_along_the_tree():
-    expected = [[steps_between(one, other) for other in range(22)] for one in range(22)]
-    assert tree_distances(SMPL_PARENTS).tolist() == expected
 
 
 def test_gates_add_up_the_weights_of_joints_in_reach(body):
