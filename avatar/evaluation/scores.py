@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import MISSING, astuple, dataclass, field, fields
 from pathlib import Path
 from typing import TypeVar, get_type_hints
@@ -63,6 +63,11 @@ class Scores:
 
     def __add__(self, other: Scores) -> Scores:
         return Scores(self.rows + other.rows, self.frames + other.frames)
+
+    def of_metrics(self, names: Collection[str]) -> Scores:
+        """Those of some metrics alone."""
+        rows = [row for row in self.rows if row.metric in names]
+        return Scores(rows, [frame for frame in self.frames if frame.metric in names])
 
 
 def write_scores(path: str | Path, scores: Scores) -> None:

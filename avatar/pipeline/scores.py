@@ -186,20 +186,29 @@ def floors_root(run: Path, settings: RunConfig) -> Path:
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
     """The sampling floor and the bare body for one outfit, kept in a file for the next method.
 
-    The file serves again when it was made with the same points, metrics, seed, scanner and data (by manifest).
+    The file serves again when it was made with the same points, seed, scanner and data (by manifest); metrics that it
+    lacks are added to it.
     """
     beside = path.with_suffix(".settings.txt")
     manifest = outfit.path / "manifest.json"
     data = hashlib.sha256(manifest.read_bytes()).hexdigest() if manifest.is_file() else outfit.path.resolve()
-    key = f"{config.split} {points} {config.score} {getattr(outfit, 'scanner', None)} {data}"
-    if path.is_file() and beside.is_file() and beside.read_text() == key:
-        return read_scores(path)
-    made = {"points": points, "commit": current_commit(), "ledger": Ledger(path.parent)}
-    floors = score_sampling_floor(outfit, config.split, config.score, **made)
-    floors = floors + score_body_floor(outfit, config.split, config.score, **made)
-    write_scores(path, floors)
-    write_whole(beside, key.encode())
-    return floors
+    draw = (config.score.scan_points, config.score.seed, config.score.motion)
+    key, wanted = f"{config.split} {points} {draw} {getattr(outfit, 'scanner', None)} {data}", config.score.metrics
+    kept, known = Scores(), []
+    if path.is_file() and beside.is_file():
+        made_with, _, names = beside.read_text().partition("\n")
+        if made_with == key:
+            kept, known = read_scores(path), names.split()
+    missing = [name for name in wanted if name not in known]
+    if missing:
+        made = {"points": points, "commit": current_commit(), "ledger": Ledger(path.parent)}
+        score = replace(config.score, metrics=missing)
+        kept = kept + score_sampling_floor(outfit, config.split, score, **made)
+        kept = kept + score_body_floor(outfit, config.split, score, **made)
+        beside.unlink(missing_ok=True)  # it never speaks of another file than the one beside it
+        write_scores(path, kept)
+        write_whole(beside, f"{key}\n{' '.join([*known, *missing])}".encode())
+    return kept.of_metrics(wanted)
 
 
 def print_tables(scores: Scores) -> None:

@@ -7,9 +7,11 @@ import pytest
 
 from avatar.checks import AvatarError, DataError
 from avatar.evaluation import scoring
+from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.export import meshing
 from avatar.export.meshing import PoissonConfig
+from avatar.pipeline import scores
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, floors_root, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
 from avatar.pipeline.torture.miniature import folder_of, prepare, train_job
@@ -84,6 +86,25 @@ def test_predict_mesh_and_evaluate_do_what_is_missing_or_damaged_and_nothing_els
     spoil(clouds[0])
     evaluate(config)
     assert len(calls) == 1
+    capsys.readouterr()
+
+
+def test_floors_keep_the_metrics_of_earlier_tables(run, count, capsys):
+    """Two tables of one outfit ask for other metrics; neither may take the other's floors away."""
+    predict(PredictConfig(run=run, points=1500, device="cpu"))
+    calls = count(scores, "score_sampling_floor")
+
+    def floors(metrics: list[str], seed: int = 0) -> tuple[set[str], set[str]]:
+        config = EvaluateConfig(runs=(run,), score=ScoreConfig(scan_points=400, metrics=metrics, seed=seed))
+        shown = {row.metric for row in evaluate(config).rows if row.method in ("sampling", "body")}
+        (file,) = (run.parents[3] / "floors").rglob("scores.csv")
+        return shown, {row.metric for row in read_scores(file).rows}
+
+    assert floors(["cd_point"]) == ({"cd_point"}, {"cd_point"})
+    assert floors(["normal_l1", "cd_point"]) == ({"normal_l1", "cd_point"}, {"normal_l1", "cd_point"})
+    assert floors(["cd_point"]) == ({"cd_point"}, {"normal_l1", "cd_point"})
+    assert len(calls) == 2
+    assert floors(["cd_point"], seed=1) == ({"cd_point"}, {"cd_point"})
     capsys.readouterr()
 
 
