@@ -26,7 +26,7 @@ from avatar.evaluation.canonical_truth import (
 from avatar.evaluation.closest import closest_on_mesh
 from avatar.evaluation.metrics import Metric
 from avatar.evaluation.scores import FrameScore, Score, Scores
-from avatar.evaluation.scoring import Label, Outfit
+from avatar.evaluation.scoring import Label, Outfit, mean_scores
 from avatar.evaluation.tables import Table, TableRow
 from avatar.records import Frame, Mesh, Template
 
@@ -262,28 +262,7 @@ def _frame_scores(comparison: CanonicalComparison, outfit: str, label: Label) ->
 def _mean_rows(frames: list[FrameScore], label: Label, points: int) -> list[Score]:
     """Means over the frames that have each metric, for one method."""
     mine = [f for f in frames if (f.method, f.variant, f.seed) == (label.method, label.variant, label.seed)]
-    rows = []
-    for name, metric in CANONICAL_METRICS.items():
-        values = [frame.value for frame in mine if frame.metric == name]
-        if values:
-            rows.append(
-                Score(
-                    table=label.table,
-                    outfit=mine[0].outfit,
-                    method=label.method,
-                    variant=label.variant,
-                    metric=name,
-                    value=float(np.mean(values)),
-                    unit=metric.unit,
-                    frames=len(values),
-                    seed=label.seed,
-                    steps=label.steps,
-                    seconds=label.seconds,
-                    points=points,
-                    commit=label.commit,
-                )
-            )
-    return rows
+    return mean_scores(mine, CANONICAL_METRICS.values(), label, "", points)
 
 
 def canonical_table(rows: Sequence[Score], outfit: str, metrics: Sequence[str] = tuple(CANONICAL_METRICS)) -> Table:

@@ -269,7 +269,7 @@ def score_frames(
             FrameScore(outfit.name, label.method, label.variant, label.seed, name, metric, float(value))
             for metric, value in values.items()
         ]
-    return Scores(_means(frames, metrics, label, outfit.dataset, round(float(np.mean(counts)))), frames)
+    return Scores(mean_scores(frames, metrics, label, outfit.dataset, round(float(np.mean(counts)))), frames)
 
 
 def _in_time(name: str) -> tuple[str, int, str]:
@@ -289,7 +289,10 @@ def _measure_sequence(metrics: list[Metric], window: list[tuple[str, torch.Tenso
     return {metric.name: metric.measure(torch.stack(clouds)) for metric in metrics}
 
 
-def _means(frames: list[FrameScore], metrics: list[Metric], label: Label, dataset: str, points: int) -> list[Score]:
+def mean_scores(
+    frames: Sequence[FrameScore], metrics: Iterable[Metric], label: Label, dataset: str, points: int
+) -> list[Score]:
+    """Means over one method's frames of one outfit, of the metrics that at least one frame has."""
     rows = []
     for metric in metrics:
         values = [frame.value for frame in frames if frame.metric == metric.name]

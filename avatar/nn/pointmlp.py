@@ -6,10 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-from avatar.checks import check_shape
 from avatar.geometry.neighbours import k_nearest
 from avatar.nn.hierarchy import Level, build_levels
-from avatar.nn.pointnet2 import FeaturePropagation, PointNet2Config, PointNorm
+from avatar.nn.pointnet2 import PointNet2Config, PointNorm, SurfaceEncoder
 from avatar.records import Template
 
 
@@ -76,7 +75,7 @@ class PointMLPLevel(nn.Module):
         return self.after(self.before(lifted).amax(dim=2))
 
 
-class PointMLP(nn.Module):
+class PointMLP(SurfaceEncoder):
     """PointMLP in the place of PointNet++: features on the template's vertices to one vector for each of them.
 
     It takes the settings of PointNet++ and reads a level's channels as the inner widths of its residual blocks
@@ -86,26 +85,6 @@ class PointMLP(nn.Module):
 
     def __init__(self, template: Template, channels: int, config: PointNet2Config):
         """Builds the encoder for one template and ``channels`` input features a vertex."""
-        super().__init__()
-        self.channels = channels
-        self.out_channels = config.propagation[-1][-1]
         levels = build_levels(template.vertices, config.hierarchy)
-        self.stages, widths = nn.ModuleList(), [channels]
-        for level, widths_here in zip(levels, config.abstraction):
-            self.stages.append(PointMLPLevel(level, widths[-1], widths_here))
-            widths.append(widths_here[-1])
-        self.propagations, coarse = nn.ModuleList(), widths.pop()
-        for level, mlp in zip(reversed(levels), config.propagation):
-            self.propagations.append(FeaturePropagation(level, coarse, widths.pop(), mlp))
-            coarse = mlp[-1]
-
-    def forward(self, features: Tensor) -> Tensor:
-        """``(B, V, C)`` features on the template's vertices to ``(B, V, C')``."""
-        check_shape("features", features, "B V C", C=self.channels)
-        pyramid = [features]
-        for stage in self.stages:
-            pyramid.append(stage(pyramid[-1]))
-        coarse = pyramid.pop()
-        for propagation in self.propagations:
-            coarse = propagation(coarse, pyramid.pop())
-        return coarse
+        incoming = [channels, *(widths[-1] for widths in config.abstraction)]
+        super().__init__(channels, levels, config, map(PointMLPLevel, levels, incoming, config.abstraction))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from torch import Tensor, nn
@@ -106,23 +107,32 @@ class FeaturePropagation(nn.Module):
         return lifted
 
 
-class PointNet2(nn.Module):
-    """Hierarchical features on a body surface (CloSET 3.1, eq. 1): one vector for every template vertex.
+class SurfaceEncoder(nn.Module):
+    """Down a hierarchy stage by stage and up again by feature propagation: what all encoders of a surface share."""
 
-    The template's vertices are the point cloud; what changes from frame to frame (posed vertices, a garment code)
-    comes as features. All sampling and grouping is computed once, here.
-    """
+    def __init__(
+        self,
+        channels: int,
+        levels: Sequence[Level],
+        config: PointNet2Config,
+        stages: Iterable[nn.Module],
+        stem: nn.Module | None = None,
+    ):
+        """Builds the encoder around its stages.
 
-    def __init__(self, template: Template, channels: int, config: PointNet2Config):
-        """Builds the encoder for one template and ``channels`` input features a vertex."""
+        Args:
+            channels: input features a vertex.
+            levels: of the hierarchy, finest first.
+            config: the last number of each list of channels is the width that a stage or propagation gives.
+            stages: one a level, ``(B, N, C)`` features of the finer level to ``(B, S, C')`` of the coarser.
+            stem: what comes before them, of the first stage's width.
+        """
         super().__init__()
-        self.channels = channels
-        self.out_channels = config.propagation[-1][-1]
-        levels = build_levels(template.vertices, config.hierarchy)
-        self.abstractions, widths = nn.ModuleList(), [channels]
-        for level, mlp in zip(levels, config.abstraction):
-            self.abstractions.append(SetAbstraction(level, widths[-1], mlp))
-            widths.append(mlp[-1])
+        self.channels, self.out_channels = channels, config.propagation[-1][-1]
+        self.stem = stem or nn.Identity()
+        self.abstractions = nn.ModuleList(stages)
+        widths = [widths[-1] for widths in config.abstraction]
+        widths = [widths[0] if stem else channels, *widths]
         self.propagations, coarse = nn.ModuleList(), widths.pop()
         for level, mlp in zip(reversed(levels), config.propagation):
             self.propagations.append(FeaturePropagation(level, coarse, widths.pop(), mlp))
@@ -131,10 +141,24 @@ class PointNet2(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """``(B, V, C)`` features on the template's vertices to ``(B, V, C')``."""
         check_shape("features", features, "B V C", C=self.channels)
-        pyramid = [features]
+        pyramid = [self.stem(features)]
         for abstraction in self.abstractions:
             pyramid.append(abstraction(pyramid[-1]))
         coarse = pyramid.pop()
         for propagation in self.propagations:
             coarse = propagation(coarse, pyramid.pop())
         return coarse
+
+
+class PointNet2(SurfaceEncoder):
+    """Hierarchical features on a body surface (CloSET 3.1, eq. 1): one vector for every template vertex.
+
+    The template's vertices are the point cloud; what changes from frame to frame (posed vertices, a garment code)
+    comes as features. All sampling and grouping is computed once, here.
+    """
+
+    def __init__(self, template: Template, channels: int, config: PointNet2Config):
+        """Builds the encoder for one template and ``channels`` input features a vertex."""
+        levels = build_levels(template.vertices, config.hierarchy)
+        incoming = [channels, *(mlp[-1] for mlp in config.abstraction)]
+        super().__init__(channels, levels, config, map(SetAbstraction, levels, incoming, config.abstraction))

@@ -5,10 +5,9 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-from avatar.checks import check_shape
 from avatar.geometry.neighbours import ball_query
 from avatar.nn.hierarchy import Grouping, build_levels
-from avatar.nn.pointnet2 import FeaturePropagation, PointNet2Config, PointNorm, SetAbstraction, point_mlp
+from avatar.nn.pointnet2 import PointNet2Config, PointNorm, SetAbstraction, SurfaceEncoder, point_mlp
 from avatar.records import Template
 
 
@@ -41,7 +40,7 @@ class InvertedResidual(nn.Module):
         return relu(features + self.mixing(self.aggregation(features)))
 
 
-class PointNeXt(nn.Module):
+class PointNeXt(SurfaceEncoder):
     """PointNeXt in the place of PointNet++: features on the template's vertices to one vector for each of them.
 
     It takes the settings of PointNet++ and reads a level's channels as the inner widths of its inverted residual
@@ -51,32 +50,16 @@ class PointNeXt(nn.Module):
 
     def __init__(self, template: Template, channels: int, config: PointNet2Config):
         """Builds the encoder for one template and ``channels`` input features a vertex."""
-        super().__init__()
-        self.channels = channels
-        self.out_channels = config.propagation[-1][-1]
         sizes = config.hierarchy
         levels = build_levels(template.vertices, sizes)
-        self.stem = point_mlp((channels, config.abstraction[0][-1]))
-        self.stages, widths = nn.ModuleList(), [config.abstraction[0][-1]]
+        first = config.abstraction[0][-1]
+        stem = point_mlp((channels, first))
+        stages, incoming = [], first
         for level, radius, (*inner, width) in zip(levels, sizes.radii, config.abstraction):
             down = Neighbourhoods(level.positions, level.finer_positions, level.groups, radius)
             groups = ball_query(level.positions, level.positions, 2 * radius, min(sizes.neighbours, len(level.groups)))
             around = Neighbourhoods(level.positions, level.positions, groups, 2 * radius)
             blocks = (InvertedResidual(around, width, wide) for wide in inner)
-            self.stages.append(nn.Sequential(SetAbstraction(down, widths[-1], (width,)), *blocks))
-            widths.append(width)
-        self.propagations, coarse = nn.ModuleList(), widths.pop()
-        for level, mlp in zip(reversed(levels), config.propagation):
-            self.propagations.append(FeaturePropagation(level, coarse, widths.pop(), mlp))
-            coarse = mlp[-1]
-
-    def forward(self, features: Tensor) -> Tensor:
-        """``(B, V, C)`` features on the template's vertices to ``(B, V, C')``."""
-        check_shape("features", features, "B V C", C=self.channels)
-        pyramid = [self.stem(features)]
-        for stage in self.stages:
-            pyramid.append(stage(pyramid[-1]))
-        coarse = pyramid.pop()
-        for propagation in self.propagations:
-            coarse = propagation(coarse, pyramid.pop())
-        return coarse
+            stages.append(nn.Sequential(SetAbstraction(down, incoming, (width,)), *blocks))
+            incoming = width
+        super().__init__(channels, levels, config, stages, stem)

@@ -32,7 +32,7 @@ def test_inverted_residual_equals_its_layers_applied_to_every_neighbour():
 def test_levels_see_positions_in_units_of_their_radius_and_blocks_twice_as_far():
     encoder = PointNeXt(TEMPLATE, 3, PointNet2Config(SIZES, ((16, 4), (32, 8)), ((8,), (4,))))
     levels = build_levels(TEMPLATE.vertices, SIZES)
-    for stage, level, radius in zip(encoder.stages, levels, SIZES.radii):
+    for stage, level, radius in zip(encoder.abstractions, levels, SIZES.radii):
         down, block = stage
         torch.testing.assert_close(down.level.positions * radius, level.positions)
         torch.testing.assert_close(down.level.finer_positions * radius, level.finer_positions)
