@@ -24,7 +24,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-import avatar.environment  # noqa: F401  first of all: it says how threads wait, which torch reads when it is imported
+# First of all: it says how threads wait, which torch reads when it is imported.
+from avatar.environment import keep_freed_memory  # isort: skip
 from avatar.checks import AvatarError, DataError
 from avatar.io.documents import check_events, read_yaml
 from avatar.pipeline.benchmarks.bench import BenchConfig
@@ -181,6 +182,7 @@ def run_job(
     In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. ``then`` follows a job
     that is the only one.
     """
+    keep_freed_memory()
     logging.basicConfig(level=logging.INFO, format="%(message)s")  # what verbs report; conf/hydra keeps Hydra quiet
     job = HydraConfig.get()
     several = job.mode is RunMode.MULTIRUN

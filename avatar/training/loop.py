@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from avatar.checks import AvatarError
-from avatar.environment import keep_freed_memory
 from avatar.nn.methods import draw_samples
 from avatar.records import Batch, LossTerms, SurfaceSamples
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
@@ -121,8 +120,6 @@ class Trainer:
             AvatarError: when losses or gradients stay non-finite, or another job holds the folder.
             Stopped: after SIGTERM or SIGUSR1, with everything saved.
         """
-        if self.device.type == "cpu":
-            keep_freed_memory()
         with lock_folder(self.folder) if self.team.leads else nullcontext(), stop_requests() as stop:
             self.resume()
             columns = ["loss", "chamfer", *TERMS, "lr", "grad_norm"]

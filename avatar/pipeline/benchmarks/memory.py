@@ -38,7 +38,7 @@ def peak_memory(build: Callable[[Job], list[Race]], job: Job, race: int, contend
 
 def _measure(build: Callable[[Job], list[Race]], job: Job, race: int, contender: str, threads: int) -> float:
     torch.set_num_threads(threads)
-    keep_freed_memory()  # as in training
+    keep_freed_memory()  # as every verb has it
     run = build(job)[race].contenders[contender]()
     if job.device == "cuda":
         torch.cuda.reset_peak_memory_stats()
