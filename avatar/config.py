@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 # First of all: it says how threads wait, which torch reads when it is imported.
-from avatar.environment import keep_freed_memory  # isort: skip
+from avatar.environment import prepare_process  # isort: skip
 from avatar.checks import AvatarError, DataError
 from avatar.io.documents import check_events, read_yaml
 from avatar.pipeline.benchmarks.bench import BenchConfig
@@ -182,7 +182,7 @@ def run_job(
     In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. ``then`` follows a job
     that is the only one.
     """
-    keep_freed_memory()
+    prepare_process()
     logging.basicConfig(level=logging.INFO, format="%(message)s")  # what verbs report; conf/hydra keeps Hydra quiet
     job = HydraConfig.get()
     several = job.mode is RunMode.MULTIRUN

@@ -1,6 +1,7 @@
 """The doctor: what is there, what is missing, and the line that mends it."""
 
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -68,6 +69,19 @@ def test_every_verb_keeps_freed_memory_for_what_comes_next():
     )
     thrown_away, kept = map(int, in_fresh_python(code).stdout.split())
     assert thrown_away > 3 * 10_000 and kept < 1000
+
+
+def test_every_verb_takes_the_smallest_numbers_for_zero_in_all_threads():
+    code = (
+        "import torch\n"
+        "from avatar.config import command\n"
+        "def left(config):\n"
+        "    tiny = torch.tensor([1e-20]).repeat(1 << 20)\n"
+        "    print(int((tiny * tiny).count_nonzero()))\n"
+        "command('bench', left)"
+    )
+    if platform.machine() in ("x86_64", "AMD64"):
+        assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.strip() == "0"
 
 
 @pytest.mark.slow
