@@ -135,11 +135,12 @@ def draw_cloud(cloud: PointCloud, camera: Camera) -> np.ndarray:
 
 
 def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
-    """The poses' pictures as one, without the error column; empty where one could not be made."""
+    """The poses' pictures as one, without the error column; empty where one could not be made, no column of nothing."""
     shown = [row.pictures[:-1] for row in rows if row.pictures[0] is not None]
     blank = np.full_like(shown[0][0].image, 255)
-    images = [[blank if picture is None else picture.image for picture in row] for row in shown]
-    return contact_sheet(images, column_labels=COLUMNS[:-1])
+    kept = [column for column in range(len(COLUMNS) - 1) if any(row[column] for row in shown)]
+    images = [[row[column].image if row[column] else blank for column in kept] for row in shown]
+    return contact_sheet(images, column_labels=[COLUMNS[column] for column in kept])
 
 
 def posed_template(avatar: TrainedAvatar, outfit: str, frame: Frame) -> PointCloud:
