@@ -104,8 +104,8 @@ def accelerator() -> str:
 def prepare_process() -> None:
     """What every verb does first, for speed: keeps freed memory, and takes numbers below 1e-38 for zero.
 
-    Processors are slow with such numbers, and the steep softplus of a signed distance is full of them: a step of the
-    texture field takes seven times as long with them. Threads started later take this over.
+    Processors are slow with such numbers, and the steep softplus of a signed distance is full of them
+    (docs/performance.md). Threads started later take this over.
     """
     import torch
 

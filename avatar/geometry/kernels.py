@@ -51,5 +51,6 @@ def nearest_fused(queries: Tensor, points: Tensor) -> Tensor:
     frames, count, _ = queries.shape
     found = torch.empty(frames, count, dtype=torch.long, device=queries.device)
     tiles = (triton.cdiv(count, QUERIES), frames)
-    search[tiles](queries.contiguous(), points.contiguous(), found, count, points.shape[1], QUERIES, POINTS)
+    with torch.cuda.device_of(queries):  # Triton launches on the current device, whatever the arrays are on
+        search[tiles](queries.contiguous(), points.contiguous(), found, count, points.shape[1], QUERIES, POINTS)
     return found

@@ -1,6 +1,6 @@
 """Rigid and affine transforms as (..., 4, 4) matrices, named destination_from_source.
 
-RoMa is imported where it is used: it loads torch's compiler, 1.5 s in which most commands do without rotations.
+RoMa is imported where it is used: it loads torch's compiler, which takes as long as torch itself.
 """
 
 from __future__ import annotations

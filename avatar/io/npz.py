@@ -20,6 +20,7 @@ SWELLING = 100  # arrays of measured things deflate ten times at most; zeros, a 
 SMALL = 16 << 20  # bytes unpacked that nobody needs to look at
 DTYPE_KINDS = {"float": "f", "int": "iu", "bool": "b", "text": "U", "number": "fiu"}
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError)  # what zipfile raises
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # one time stamp for all members, so that equal arrays give equal bytes
 
 
@@ -58,7 +59,7 @@ def read_arrays(
             dims: dict[str, int] = {}
             wanted = {**required, **{key: optional[key] for key in optional if key in members}}
             return {key: _read(path, archive, members[key], key, wanted[key], dims) for key in wanted}
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+    except DAMAGED as error:
         mend = "Make or download it again."
         raise DataError(path, f"expected a sound npz file, reading failed: {error}.", mend) from error
 
@@ -113,8 +114,8 @@ def _read_header(path: Path, key: str, stream: IO[bytes]) -> tuple[tuple[int, ..
     """Shape, order and type of an array, by numpy, which takes its header for Python and may raise what Python does."""
     try:
         return READERS[np.lib.format.read_magic(stream)](stream)
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError):
-        raise
+    except DAMAGED:
+        raise  # told by `read_arrays`
     except Exception as error:
         raise DataError(path, f"{key}: expected a plain array, its header is not one ({error}).") from error
 
