@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
-from avatar.nn.decoders import Decoded, DecoderConfig, ShapeDecoder
+from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, bare_body
 from avatar.nn.encoders import Encoder, build_encoder
 from avatar.nn.locality import LocalPoseConfig, LocalPoseEncoder
 from avatar.nn.pointnet2 import PointNet2Config
@@ -65,6 +65,7 @@ class ClosetConfig:
     skinning: Skinning = Skinning.body
     train_field: bool = False  # whether training moves the canonicalizer's field, too
     encoder: Encoder = Encoder.pointnet2  # of both branches; conf/encoder/ has channels for each kind
+    normals: Normals = Normals.body  # what decoded normals start from; free as in the paper
 
     def __post_init__(self):
         if not (self.template or self.pose):
@@ -135,11 +136,6 @@ class ClosetAvatar(nn.Module):
             pose_vertices = pose_vertices + torch.randn_like(pose_vertices) * self.config.pose_noise
         return interpolate(self.pose_encoder(pose_vertices), samples)
 
-    def skin(self, samples: SurfaceSamples) -> Decoded:
-        """The bare body, which both decoders correct: no offset, and the body's own normals ``(1, N, 3)``."""
-        normals = interpolate(self.skin_normals, samples)[None]
-        return Decoded(torch.zeros_like(normals), normals)
-
     def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
         """Predicts the dressed surface of each frame at the sampled template points.
 
@@ -165,7 +161,7 @@ class ClosetAvatar(nn.Module):
         if self.config.pose and wrinkles:
             pose = self.pose_features(batch, samples)
             parts.append(self.pose_decoder(torch.cat([pose, garment[row]], dim=-1)))
-        local = sum(parts, self.skin(samples))
+        local = sum(parts, bare_body(self.skin_normals, samples, self.config.normals))
 
         scale = self.config.offset_scale
         offsets = (local.offsets * scale).float()
@@ -212,6 +208,6 @@ class ClosetAvatar(nn.Module):
         if not self.config.template:
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")
         decoded = self.garment_decoder(self.surface_features(self.codes[outfit : outfit + 1], samples))
-        dressed = self.skin(samples) + decoded
+        dressed = bare_body(self.skin_normals, samples, self.config.normals) + decoded
         points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
         return Decoded(points, normalize(dressed.normals, dim=-1))

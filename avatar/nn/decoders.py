@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from enum import Enum
 
 import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError
+from avatar.geometry.surface import interpolate
 from avatar.nn.pointnet2 import PointNorm
+from avatar.records import SurfaceSamples
 
 
 @dataclass
@@ -34,6 +37,26 @@ class Decoded:
 
     def __add__(self, other: Decoded) -> Decoded:
         return Decoded(self.offsets + other.offsets, self.normals + other.normals)
+
+
+class Normals(Enum):
+    """What decoded normals start from; one option of all methods, so that none has a head start over another."""
+
+    body = "body"  # the body's own normals, which the decoders correct
+    free = "free"  # nothing, as in the papers of POP, SCALE and CloSET
+
+
+def bare_body(skin_normals: Tensor, samples: SurfaceSamples, normals: Normals) -> Decoded:
+    """Zero offsets and the normals that decoders correct, ``(1, N, 3)``: the body's, or none.
+
+    Args:
+        skin_normals: ``(V, 3)`` unit normals of the template's vertices.
+        samples: N points on the template.
+        normals: what decoded normals start from.
+    """
+    start = interpolate(skin_normals, samples)[None]
+    zeros = torch.zeros_like(start)
+    return Decoded(zeros, start if normals is Normals.body else zeros)
 
 
 def softplus_mlp(widths: tuple[int, ...]) -> nn.Sequential:

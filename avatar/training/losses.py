@@ -35,8 +35,7 @@ class LossConfig:
     scan_to_points: float = 1e4
     points_to_scan: float = 1e4
     normal: float = 1.0
-    normal_start: float = 0.6  # share of training after which the normal term counts (POP: epoch 250 of 400)
-    normal_before: float = 1e-6  # factor on the normal term until then
+    normal_start: float = 0.6  # share of training before which there is no normal term (POP: epoch 250 of 400)
     offset: float = 2e3  # mean |r|^2
     wrinkle: float = 0.0  # mean |r^p|^2; what all poses share then moves into the garment template
     wrinkle_normal: float = 0.0  # the same for what the pose adds to the normals
@@ -58,7 +57,8 @@ def point_avatar_loss(prediction: Prediction, batch: Batch, config: LossConfig, 
         prediction: what the network gave for the batch.
         batch: with ``scan_points`` and ``scan_normals (B, M, 3)``.
         config: weights and switches.
-        progress: share of the training that is done, in [0, 1]; the normal term is switched on by it.
+        progress: share of the training that is done, in [0, 1]; the normal term is switched on by it. Until then it
+            has no gradient at all: Adam makes full steps of any factor, however small.
 
     Returns:
         `LossTerms` reduced to means over points and frames: square metres for distances, L1 of unit normals
@@ -86,7 +86,7 @@ def point_avatar_loss(prediction: Prediction, batch: Batch, config: LossConfig, 
         raw["code"] = prediction.codes.square().mean()
     weights = {name: getattr(config, name) for name in raw}
     if progress < config.normal_start:
-        weights["normal"] *= config.normal_before
+        weights["normal"] = 0.0
     return LossTerms(raw, {name: value * weights[name] for name, value in raw.items() if weights[name]})
 
 

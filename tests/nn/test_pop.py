@@ -176,7 +176,7 @@ def test_explicit_template_is_one_for_all_poses():
     turned = interpolate(batch.vertex_transforms[..., :3, :3].flatten(-2), samples).unflatten(-1, (3, 3))
     added = (turned.inverse() @ prediction.normals[..., None])[..., 0]
     garment = (turned.inverse() @ alone.normals[..., None])[..., 0]
-    spanned = torch.stack([added, garment, prediction.wrinkle_normals], dim=-1)
+    spanned = torch.stack([added, garment, prediction.wrinkle_normals], dim=-1)  # both with the body's in them
     assert torch.linalg.det(spanned).abs().max() < 1e-5  # n is garment's plus what the pose adds, up to length
     template = model.garment_template(1, samples)
     resting = interpolate(ATLASED.vertices, samples)

@@ -18,7 +18,7 @@ from avatar.training.checkpoints import load_checkpoint
 from avatar.training.locks import HELD, lock_folder
 from avatar.training.logs import read_log
 from avatar.training.loop import Schedule, TrainConfig, Trainer
-from avatar.training.losses import TERMS
+from avatar.training.losses import TERMS, LossConfig
 from avatar.training.signals import Stopped
 
 
@@ -159,6 +159,18 @@ def test_rates_follow_their_schedule(tmp_path):
     assert flat.rate_factor() == 1
 
 
+def test_normals_are_not_trained_before_their_term_starts(tmp_path):
+    """Adam makes full steps of a gradient however small, so there must be none."""
+    trainer = make_trainer(tmp_path, steps=10, loss=LossConfig(normal_start=0.5))
+    last = [*trainer.model.pose_decoder.normal_branch.parameters()]
+    before = [value.clone() for value in last]
+    for step in range(10):
+        trainer.step = step
+        trainer.train_step(random_batch())
+        moved = not all(torch.equal(value, old) for value, old in zip(last, before))
+        assert moved == (step >= 5)
+
+
 def test_template_points_are_fixed_or_fresh(tmp_path):
     fixed, fresh = make_trainer(tmp_path, fresh_points=False), make_trainer(tmp_path)
     assert torch.equal(fixed.samples_at(0).barycentric, fixed.samples_at(5).barycentric)
@@ -167,7 +179,7 @@ def test_template_points_are_fixed_or_fresh(tmp_path):
 
 
 def test_non_finite_losses_leave_the_weights_alone_and_end_training(tmp_path):
-    trainer = make_trainer(tmp_path, steps=30)
+    trainer = make_trainer(tmp_path, steps=30, loss=LossConfig(normal_start=0.0))
     before = {name: value.clone() for name, value in trainer.model.named_parameters()}
     broken = random_batch()
     broken = replace(broken, scan_normals=torch.full_like(broken.scan_normals, float("nan")))

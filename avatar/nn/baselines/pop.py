@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.surface import interpolate
+from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions
 from avatar.nn.baselines.atlas import Atlas, look_up, uv_and_patch
 from avatar.nn.baselines.unet import UNet, UNetConfig
-from avatar.nn.decoders import Decoded, DecoderConfig, ShapeDecoder
+from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, bare_body
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
 PLACE_CHANNELS = 4  # UV coordinates, and patch coordinates that are zero: POP's decoder has kept SCALE's input
@@ -41,6 +41,7 @@ class PopConfig:
     offset_scale: float = 0.02  # metres one unit of a decoder's output stands for
     template: bool = False  # CloSET's explicit template decomposition on POP's features (its table 5, POP + ETD)
     points: PointSource = PointSource.grid
+    normals: Normals = Normals.body  # what decoded normals start from; free as in the paper
 
     def __post_init__(self):
         if min(self.map_size, self.code_channels) < 1 or self.smoothing < 0:
@@ -72,6 +73,7 @@ class PopAvatar(nn.Module):
         self.config = config
         self.atlas = Atlas(template, config.map_size)
         self.register_buffer("vertices", template.vertices.clone(), persistent=False)
+        self.register_buffer("skin_normals", vertex_normals(template.vertices, template.faces), persistent=False)
         channels, size = config.code_channels, config.map_size
         self.codes = nn.Parameter(torch.randn(outfits, channels, size, size) * config.code_std)
         convolutions = [nn.Conv2d(channels, channels, 5, padding=2, bias=False) for _ in range(config.smoothing)]
@@ -116,7 +118,7 @@ class PopAvatar(nn.Module):
             pose = look_up(self.pose_encoder(self.atlas.position_map(batch.pose_vertices)), uv)
             parts.append(self.pose_decoder(torch.cat([pose, garment[row]], dim=-1)))
         parts = [Decoded(part.offsets.float() * self.config.offset_scale, part.normals.float()) for part in parts]
-        local = sum(parts[1:], parts[0])
+        local = sum(parts, bare_body(self.skin_normals, samples, self.config.normals))
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
             linear = interpolate(batch.vertex_transforms[..., :3, :3].flatten(-2), samples).unflatten(-1, (3, 3))
             points = interpolate(batch.vertices, samples) + transform_directions(linear, local.offsets)
@@ -142,5 +144,6 @@ class PopAvatar(nn.Module):
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")
         uv = self.atlas.place(samples)
         decoded = self.garment_decoder(self.garment_features(self.codes[outfit : outfit + 1], uv))
-        points = interpolate(self.vertices, samples) + decoded.offsets * self.config.offset_scale
-        return Decoded(points, normalize(decoded.normals, dim=-1))
+        dressed = bare_body(self.skin_normals, samples, self.config.normals) + decoded
+        points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
+        return Decoded(points, normalize(dressed.normals, dim=-1))

@@ -18,7 +18,7 @@ from avatar.geometry.transforms import transform_directions
 from avatar.geometry.uv import uv_barycentric
 from avatar.nn.baselines.atlas import Atlas, uv_and_patch
 from avatar.nn.baselines.unet import UNet, UNetConfig
-from avatar.nn.decoders import DecoderConfig, ShapeDecoder
+from avatar.nn.decoders import DecoderConfig, Normals, ShapeDecoder
 from avatar.nn.pointnet2 import point_mlp
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
@@ -55,6 +55,7 @@ class ScaleConfig:
     map_size: int = 32  # pixels a side of the position map; each pixel in the atlas can be a patch
     patches: int = 798  # at most; all pixels of the atlas where there are fewer
     pose_feature: PoseFeature = PoseFeature.local
+    normals: Normals = Normals.body  # of a patch's triangle, which the decoder corrects; free as in the paper
 
     def __post_init__(self):
         if self.patches < 1:
@@ -186,8 +187,11 @@ class ScaleAvatar(nn.Module):
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
             frames = self.patch_frames(batch.vertices)[:, patch]
             offsets = transform_directions(frames, local.offsets.float())
+            normals = local.normals.float()
+            if self.config.normals is Normals.body:
+                normals = normals + normals.new_tensor([0.0, 0.0, 1.0])  # the third axis of a frame is the normal
             return Prediction(
                 points=interpolate(batch.vertices, self.patches)[:, patch] + offsets,
-                normals=normalize(transform_directions(frames, local.normals.float()), dim=-1),
+                normals=normalize(transform_directions(frames, normals), dim=-1),
                 offsets=offsets,
             )
