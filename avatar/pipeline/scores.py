@@ -21,6 +21,7 @@ from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.ledger import Ledger
 from avatar.io.motions import read_motion
 from avatar.io.npz import write_whole
+from avatar.nn.decoders import Normals
 from avatar.pipeline.methods import is_implicit, load_avatar
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
 from avatar.training.prediction import predict_frames, predict_motion
@@ -166,10 +167,12 @@ def score_runs(config: EvaluateConfig) -> Scores:
 
 
 def variant_of(config: RunConfig) -> str:
-    """What tells a run from its method's usual one: outfits it shares a network with, less data, a canonicalizer."""
+    """What tells a run from its method's usual one: several outfits, less data, free normals, a canonicalizer."""
     parts = [f"{len(config.outfit)} outfits"] if len(config.outfit) > 1 else []
     if config.split.train_fraction < 1:
         parts.append(f"{100 * config.split.train_fraction:g}%")
+    if config.method.settings.get("normals") == Normals.free.value:
+        parts.append("free normals")
     if config.canonical != "default":
         parts.append(config.canonical)
     return ", ".join(parts)

@@ -48,7 +48,7 @@ def test_every_method_corrects_the_bodys_normals_unless_asked_not_to(name):
 
 @pytest.mark.parametrize("case", CASES)
 def test_decoders_that_give_nothing_leave_the_bodys_normals_or_none(case):
-    model, batch, samples, prediction = predict(case, Normals.body, (0.0, 0.0, 0.0))
+    _, batch, samples, prediction = predict(case, Normals.body, (0.0, 0.0, 0.0))
     linear = batch.vertex_transforms[:, 0, :3, :3]
     if case == "scale":  # a patch's normal is that of its triangle
         corners = batch.vertices[0, samples.vertex_ids]
@@ -66,7 +66,7 @@ def test_decoders_that_give_nothing_leave_the_bodys_normals_or_none(case):
 def test_what_decoders_give_is_added_to_the_bodys_normals_or_stands_alone(case):
     given = torch.tensor([0.3, 2.0, -0.5])
     for normals in Normals:
-        model, batch, samples, prediction = predict(case, normals, tuple(given.tolist()))
+        _, batch, samples, prediction = predict(case, normals, tuple(given.tolist()))
         skin = interpolate(vertex_normals(ATLASED.vertices, ATLASED.faces), samples)
         local = given + skin if normals is Normals.body else given.expand_as(skin)
         linear = batch.vertex_transforms[0, 0, :3, :3]
