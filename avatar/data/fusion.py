@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from avatar.data.patterns import paint
 from avatar.data.scanner import (
@@ -26,6 +25,7 @@ from avatar.data.scanner import (
     scan_mesh,
 )
 from avatar.geometry.surface import vertex_normals
+from avatar.geometry.trees import build_tree
 from avatar.records import Scan
 
 CORNERS = np.arange(3)
@@ -146,7 +146,7 @@ def rim_partners(scan: Scan, distance: float) -> tuple[np.ndarray, np.ndarray]:
     links = _links(scan)
     rim = np.flatnonzero(np.abs(links - links.T).sum(axis=1))  # an edge that no other face runs along the other way
     nearby = min(NEARBY, len(scan.points))
-    distances, ids = cKDTree(scan.points).query(scan.points[rim], k=nearby, distance_upper_bound=distance)
+    distances, ids = build_tree(scan.points).query(scan.points[rim], k=nearby, distance_upper_bound=distance)
     known = np.isfinite(distances)
     ids = np.where(known, ids, 0)
     apart = np.linalg.norm(scan.canonical[ids] - scan.canonical[rim, None], axis=-1) > FAR_AT_REST * distance

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avatar.checks import AvatarError
 from avatar.data.patterns import Pattern, paint
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
+from avatar.geometry.trees import build_tree
 from avatar.records import Scan
 
 FACING = -0.3  # cosine between normals below which two surfaces look at each other
@@ -148,7 +148,7 @@ def facing_partners(points: np.ndarray, normals: np.ndarray, distance: float) ->
     Returns:
         Two index arrays ``(K,)``: the points, and for each the nearest point ahead of it that faces it.
     """
-    pairs = cKDTree(points, balanced_tree=False).query_pairs(distance, output_type="ndarray")
+    pairs = build_tree(points).query_pairs(distance, output_type="ndarray")
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = pairs[np.einsum("kc,kc->k", normals[pairs[:, 0]], normals[pairs[:, 1]]) < FACING]
     across = points[pairs[:, 1]] - points[pairs[:, 0]]
@@ -162,7 +162,7 @@ def facing_partners(points: np.ndarray, normals: np.ndarray, distance: float) ->
 def outside_holes(points: np.ndarray, holes: int, radius: float, rng: np.random.Generator) -> np.ndarray:
     """Which points ``(M,)`` lie beyond the radius of a few of the points, drawn at random."""
     centres = points[rng.integers(len(points), size=holes)]
-    kept = cKDTree(centres).query(points, distance_upper_bound=radius)[0] == np.inf
+    kept = build_tree(centres).query(points, distance_upper_bound=radius)[0] == np.inf
     if not kept.any():
         raise AvatarError(f"holes: expected some points to be left, {holes} holes of {radius} m took them all.")
     return kept

@@ -12,13 +12,13 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from avatar.body.skinning import blend_transforms
 from avatar.checks import AvatarError, check_shape
 from avatar.data.scanner import DressedSurface
 from avatar.evaluation.canonical_truth import Canonicalized, carry_with
 from avatar.geometry.transforms import invert_affine, transform_points
+from avatar.geometry.trees import build_tree
 from avatar.records import BodyFit, Frame, Template
 
 ROUNDS = 3  # bind positions depend on the weights a little; both are found in turn
@@ -58,13 +58,13 @@ class BestSkinning:
         joints = torch.stack([torch.from_numpy(outfit.load_body(split, name).joint_transforms) for name in names])
         first = surfaces[0]
         cloth, rest = first.labels > 0, first.canonical
-        nearest = cKDTree(self.template.vertices.numpy()).query(rest.numpy())[1]
+        nearest = build_tree(self.template.vertices.numpy()).query(rest.numpy())[1]
         weights = self.template.weights[torch.from_numpy(nearest)].clone()
         posed = torch.stack([surface.vertices[cloth] for surface in surfaces])
         bind = self.template.canonical_from_bind
         weights[cloth] = fit_weights(rest[cloth], posed, joints, weights[cloth], bind).to(weights)
         self.weights = weights.numpy()
-        self._tree = cKDTree(_labelled(rest.numpy(), first.labels.numpy()))
+        self._tree = build_tree(_labelled(rest.numpy(), first.labels.numpy()))
 
     def weights_at(self, canonical: np.ndarray, labels: np.ndarray) -> np.ndarray:
         """Weights ``(M, J)`` at places at rest ``(M, 3)`` on the surfaces of some labels ``(M,)``."""

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from avatar.body.skinning import skin_transforms
 from avatar.checks import AvatarError
 from avatar.geometry.transforms import invert_affine, transform_points
+from avatar.geometry.trees import build_tree
 from avatar.records import BodyFit, CanonicalScan, Frame, Scan, Template
 
 CONTACT = 0.02  # metres between two points of a scan that touch
@@ -76,7 +76,7 @@ def contact_points(points: np.ndarray, canonical: np.ndarray) -> np.ndarray:
         ``(M,)`` bool.
     """
     touching = np.zeros(len(points), bool)
-    pairs = cKDTree(points).query_pairs(CONTACT, output_type="ndarray")
+    pairs = build_tree(points).query_pairs(CONTACT, output_type="ndarray")
     apart = np.linalg.norm(canonical[pairs[:, 0]] - canonical[pairs[:, 1]], axis=1) > APART
     touching[pairs[apart]] = True
     return touching
@@ -84,7 +84,7 @@ def contact_points(points: np.ndarray, canonical: np.ndarray) -> np.ndarray:
 
 def weights_under(canonical: np.ndarray, template: Template) -> np.ndarray:
     """Skinning weights of the nearest vertex of the body at rest: points at rest ``(M, 3)`` to ``(M, J)``."""
-    _, nearest = cKDTree(template.vertices.numpy()).query(canonical)
+    _, nearest = build_tree(template.vertices.numpy()).query(canonical)
     return template.weights.numpy()[nearest]
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from avatar.checks import AvatarError, check_finite, check_shape
+from avatar.geometry.trees import build_tree
 
 FIRST_CANDIDATES = 8  # triangles tried for each query before asking whether a farther one could be closer
 CHUNK_PAIRS = 1 << 20  # query-triangle pairs held at once: about 0.3 GB of temporaries
@@ -66,7 +66,7 @@ class _TriangleSearch:
 
     def __init__(self, corners: np.ndarray):
         centres, self.owners, self.reach = _cover(corners)
-        self.corners, self.tree = corners, cKDTree(centres)
+        self.corners, self.tree = corners, build_tree(centres)
         first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         self.frames = np.concatenate([corners[:, 0], first, second], axis=1)
         dots = [(u * v).sum(axis=1) for u, v in ((first, first), (first, second), (second, second))]

@@ -7,11 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.surface import interpolate, sample_surface
+from avatar.geometry.trees import build_tree
 from avatar.geometry.uv import seam_edges
 from avatar.records import PointCloud, Scan, SurfaceSamples, Template
 
@@ -69,7 +69,7 @@ def seam_distance(points: np.ndarray, vertices: np.ndarray, edges: np.ndarray) -
     which = np.repeat(np.arange(len(edges)), counts)
     places = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
     shares = (places / np.maximum(counts[which] - 1, 1))[:, None]
-    return cKDTree(first[which] * (1 - shares) + second[which] * shares).query(points, workers=-1)[0]
+    return build_tree(first[which] * (1 - shares) + second[which] * shares).query(points, workers=-1)[0]
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class PointErrors:
 
 def point_errors(cloud: PointCloud, scan: Scan) -> PointErrors:
     """The errors of predicted points against a scan of the same frame."""
-    nearest = cKDTree(scan.points).query(cloud.points, workers=-1)[1]
+    nearest = build_tree(scan.points).query(cloud.points, workers=-1)[1]
     normals = scan.normals[nearest].astype(np.float64)
     distance = np.abs(((cloud.points - scan.points[nearest]) * normals).sum(axis=1))
     clothed = np.ones(len(nearest), bool) if scan.labels is None else scan.labels[nearest] > 0

@@ -14,9 +14,9 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from avatar.checks import INSTALL_LINES, AvatarError, check_finite, require
+from avatar.geometry.trees import build_tree
 
 AZIMUTHS = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0, "side": 90.0, "three_quarter": 35.0}
 BACKGROUND = (0.957, 0.957, 0.945)
@@ -114,7 +114,7 @@ def shade(normals: np.ndarray, colors: str | tuple | np.ndarray, camera: Camera)
 
 def disc_radii(points: np.ndarray) -> np.ndarray:
     """Disc sizes ``(N,)`` that close to a surface at the points' own spacing, yet leave real gaps to be seen."""
-    distances, _ = cKDTree(points, balanced_tree=False).query(points, k=min(DISC_NEIGHBOUR, len(points)))
+    distances, _ = build_tree(points).query(points, k=min(DISC_NEIGHBOUR, len(points)))
     spacing = distances.reshape(len(points), -1)[:, -1]
     typical = np.median(spacing)
     return DISC_SPACING * np.maximum(np.clip(spacing, 0.7 * typical, 1.5 * typical), 1e-4)

@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
+from avatar.geometry.trees import build_tree
 from avatar.records import Mesh, PointCloud
 
 NEIGHBOURS = 24
@@ -37,7 +37,7 @@ def trim_surface(mesh: Mesh, cloud: PointCloud, max_hole: float, min_part: float
     Returns:
         A mesh without unused vertices; without any triangle when nothing is supported.
     """
-    tree = cKDTree(cloud.points)
+    tree = build_tree(cloud.points)
     near, _ = tree.query(cloud.points, k=min(SPACING_NEIGHBOUR, len(cloud.points)))
     holes = np.maximum(max_hole, HOLE_SPACINGS * near[:, -1])
     distances, ids = tree.query(mesh.vertices, k=min(NEIGHBOURS, len(cloud.points)))

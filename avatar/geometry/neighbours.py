@@ -9,12 +9,11 @@ from functools import cache
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.trees import Tree, build_tree
 
-LEAF = 32  # points in a leaf of the trees; on surfaces a little faster than scipy's 10 or 16
 CUDA_CHUNK_PAIRS = 1 << 27  # distances held at once by the chunked CUDA search: 512 MiB in float32
 report = logging.getLogger(__name__)
 
@@ -55,7 +54,7 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
             return fused(queries.float(), points.float()).unsqueeze(-1)
         return torch.stack([_k_nearest_chunked(q, p, k) for q, p in zip(queries, points)])
     pairs = zip(queries.double().cpu().numpy(), points.double().cpu().numpy())
-    found = [_ask(_build_tree(cloud), query, k) for query, cloud in pairs]
+    found = [_ask(build_tree(cloud), query, k) for query, cloud in pairs]
     return torch.stack(found).to(queries.device)
 
 
@@ -82,7 +81,7 @@ def nearest_both_ways(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         return nearest(points, others), nearest(others, points)
     clouds = [cloud.double().numpy() for batch in (points, others) for cloud in batch]
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # scipy lets go of Python's lock
-        trees = list(pool.map(_build_tree, clouds))
+        trees = list(pool.map(build_tree, clouds))
         found = list(pool.map(_ask_in_order, trees, trees[len(points) :] + trees[: len(points)]))
     return torch.stack(found[: len(points)]), torch.stack(found[len(points) :])
 
@@ -103,15 +102,7 @@ def fused_search() -> Callable[[Tensor, Tensor], Tensor] | None:
     return nearest_fused
 
 
-def _build_tree(cloud: np.ndarray) -> cKDTree:
-    """A tree over one cloud of finite points."""
-    try:
-        return cKDTree(cloud, leafsize=LEAF, balanced_tree=False)
-    except ValueError as error:
-        raise AvatarError(f"points: expected finite coordinates ({error}).") from error
-
-
-def _ask(tree: cKDTree, queries: np.ndarray, k: int) -> Tensor:
+def _ask(tree: Tree, queries: np.ndarray, k: int) -> Tensor:
     """Indices ``(N, k)`` of the nearest points of a tree to finite queries."""
     try:
         _, ids = tree.query(queries, k=k, workers=torch.get_num_threads())
@@ -120,7 +111,7 @@ def _ask(tree: cKDTree, queries: np.ndarray, k: int) -> Tensor:
     return torch.from_numpy(ids).reshape(len(queries), k).long()
 
 
-def _ask_in_order(tree: cKDTree, other: cKDTree) -> Tensor:
+def _ask_in_order(tree: Tree, other: Tree) -> Tensor:
     """Indices ``(N,)`` of the nearest points of the other tree to this tree's points, asked in this tree's order."""
     ids = torch.empty(tree.n, dtype=torch.long)
     ids[tree.indices] = torch.from_numpy(other.query(tree.data[tree.indices])[1])

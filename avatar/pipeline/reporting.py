@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from avatar.data.outfits import Outfit
 from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent, write_report
@@ -21,6 +20,7 @@ from avatar.export.pictures import (
     render_points,
     save_picture,
 )
+from avatar.geometry.trees import build_tree
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.pipeline.methods import load_avatar
@@ -111,7 +111,7 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
     path = predictions_folder(config.run, config.split, outfit.name) / f"{name}.ply"
     if path.is_file():
         cloud = read_points(path)
-        errors = cKDTree(scan.points).query(cloud.points, workers=-1)[0]
+        errors = build_tree(scan.points).query(cloud.points, workers=-1)[0]
         hot = render_error(cloud, errors, MAX_ERROR, camera)
         pictures[1] = Picture(draw_cloud(cloud, camera), f"predicted points for {name}")
         pictures[4] = Picture(

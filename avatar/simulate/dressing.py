@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from avatar.body.model import BodyModel
 from avatar.body.skinning import blend_transforms
 from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import axis_angle_from_rotation, rotation_from_axis_angle, transform_points
+from avatar.geometry.trees import build_tree
 from avatar.simulate.garments import Garment, cut_garment
 from avatar.simulate.implicit import smoothing_matrix
 from avatar.simulate.layering import lift_off, tuck
@@ -104,7 +104,7 @@ class DressedBody:
         spread, _ = smoothing_matrix(faces, len(vertices))
         layers = []
         for garment, start in zip(self.garments, self.offsets):
-            gap, ids = cKDTree(vertices).query(garment.vertices)
+            gap, ids = build_tree(vertices).query(garment.vertices)
             average, _ = smoothing_matrix(garment.faces, len(garment.vertices))
             weights = self.body.weights.numpy()[ids].astype(np.float64)
             for _ in range(5):
@@ -224,6 +224,6 @@ class DressedBody:
 
 def covered_skin(vertices: np.ndarray, garment: Garment) -> np.ndarray:
     """Mask ``(V,)`` of body vertices that lie close under a garment."""
-    gap, ids = cKDTree(garment.vertices).query(vertices)
+    gap, ids = build_tree(garment.vertices).query(vertices)
     _, rim = smoothing_matrix(garment.faces, len(garment.vertices))
     return (gap < COVERED_GAP) & ~rim[ids]

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.spatial import cKDTree
 
 from avatar.body.model import BodyModel
 from avatar.checks import AvatarError
 from avatar.geometry.transforms import invert_rigid, transform_points
+from avatar.geometry.trees import build_tree
 from avatar.simulate.implicit import (
     Grid,
     clip,
@@ -93,7 +93,7 @@ def cut_garment(body: BodyModel, config: GarmentConfig) -> Garment:
     grid = garment_field(cutting, config)
     vertices, faces = surface_nets(grid)
     vertices = relax(vertices, faces, grid, 6)
-    nearest = cKDTree(cutting.vertices)
+    nearest = build_tree(cutting.vertices)
     for cut in cuts(cutting, config):
         _, ids = nearest.query(vertices)
         vertices, faces = clip(vertices, faces, cut(vertices, cutting.arms[ids]))
@@ -119,7 +119,7 @@ def garment_field(cutting: Cutting, config: GarmentConfig) -> Grid:
     flat = points.reshape(-1, 3)
     reach = 0.1 + max(config.ease, config.sleeve_ease)
     distance = body_distances(cutting.vertices, cutting.faces, flat, reach)
-    _, ids = cKDTree(cutting.vertices).query(flat)
+    _, ids = build_tree(cutting.vertices).query(flat)
     ease = config.ease + (config.sleeve_ease - config.ease) * cutting.arms[ids]
     field = distance - ease - crotch_fill(cutting, flat)
     if config.drop is not None:
@@ -132,7 +132,7 @@ def crotch_fill(cutting: Cutting, points: np.ndarray) -> np.ndarray:
 
     Also keeps the thin gap between the thighs from falling through the grid.
     """
-    away = [cKDTree(cutting.vertices[cutting.vertices[:, 0] * side > 0]).query(points)[0] for side in (1, -1)]
+    away = [build_tree(cutting.vertices[cutting.vertices[:, 0] * side > 0]).query(points)[0] for side in (1, -1)]
     mix = np.clip(0.5 + 0.5 * (away[0] - away[1]) / CROTCH, 0, 1)
     below = np.clip((cutting.joints["pelvis"][1] - points[:, 1]) / CROTCH, 0, 1)
     return below * CROTCH * mix * (1 - mix)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.body.open import open_body, open_body_shapes
 from avatar.checks import AvatarError
 from avatar.geometry.surface import vertex_normals
+from avatar.geometry.trees import build_tree
 from avatar.simulate.angles import LIMITS, Angles, pose_from_angles
 from avatar.simulate.sequences import SEQUENCES, authored_motion
 
@@ -158,7 +158,7 @@ def _touching_parts(body: BodyModel) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def _touch(points: np.ndarray, normals: np.ndarray, mover: np.ndarray, rest: np.ndarray, clearance: float) -> bool:
     """Whether any mover vertex is within the clearance of, or behind, the surface of the rest."""
-    distance, nearest = cKDTree(points[rest]).query(points[mover])
+    distance, nearest = build_tree(points[rest]).query(points[mover])
     across = points[mover] - points[rest[nearest]]
     behind = (across * normals[rest[nearest]]).sum(axis=1) < 0
     return bool(((distance < clearance) | (behind & (distance < 0.15))).any())
