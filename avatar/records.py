@@ -144,7 +144,8 @@ class Batch:
     (B, V, 4, 4)``, ``joint_transforms (B, J, 4, 4)``, ``scan_points (B, M, 3)``, ``scan_normals (B, M, 3)``,
     ``outfit_ids (B,)`` int64 index into the run's outfits, ``names``. ``canonical`` is True where ``vertices``,
     ``vertex_transforms`` and scans are those of the canonical pose (training in canonical space); what tells the
-    pose, ``pose_vertices`` and ``joint_transforms``, is the posed body's all the same.
+    pose, ``pose_vertices`` and ``joint_transforms``, is the posed body's all the same. ``step_outfits (O,)`` are the
+    outfits of the whole step, ascending, where this batch is one process's share of it (None: it is all of it).
     """
 
     pose_vertices: Tensor
@@ -156,6 +157,12 @@ class Batch:
     outfit_ids: Tensor
     names: tuple[str, ...]
     canonical: bool = False
+    step_outfits: Tensor | None = None
+
+    @property
+    def outfits(self) -> Tensor:
+        """The outfits ``(O,)`` that a network encodes for this step, ascending: each once, in whatever share it is."""
+        return self.outfit_ids.unique() if self.step_outfits is None else self.step_outfits
 
     def to(self, device: torch.device | str) -> Batch:
         """The same batch on another device."""

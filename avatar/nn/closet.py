@@ -88,6 +88,8 @@ class ClosetAvatar(nn.Module):
     see the pose, so it runs once an outfit in the batch, whatever the number of frames.
     """
 
+    outfit_modules = ("garment_encoder", "garment_decoder")  # see `distributed.share_norms`
+
     def __init__(self, template: Template, outfits: int, config: ClosetConfig):
         """Builds the network on a body template for a number of outfits."""
         super().__init__()
@@ -151,7 +153,8 @@ class ClosetAvatar(nn.Module):
         check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=len(self.vertices))
         if not (wrinkles or self.config.template):
             raise AvatarError("wrinkles: a model without explicit garment template has nothing else to predict.")
-        outfits, row = batch.outfit_ids.unique(return_inverse=True)
+        outfits = batch.outfits
+        row = torch.searchsorted(outfits, batch.outfit_ids)
         codes = self.codes[outfits]
         garment = self.surface_features(codes, samples)
         parts = []

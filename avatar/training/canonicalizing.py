@@ -38,6 +38,7 @@ from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.building import building
 from avatar.training.checkpoints import read_weights, write_weights
 from avatar.training.cycles import CycleConfig, CycleTrainer, find_code
+from avatar.training.distributed import refuse_team
 from avatar.training.runs import choose_device, save_settings
 
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
@@ -150,6 +151,7 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     Raises:
         AvatarError: when the folder holds a run with other settings, or training fails.
     """
+    refuse_team("canonicalizer")
     frames = frames or config.frames()
     template = frames.outfits[0].template
     save_settings(config)

@@ -1,8 +1,8 @@
 """Data-parallel training under torchrun: every process takes its share of each batch, and all take the same step.
 
-Gradients are averaged and the statistics of every normalisation are those of the whole batch, so a run gives the
-losses of one process with the same batch, to rounding (with noise on the input: in distribution). NCCL serves CUDA,
-gloo the CPU.
+Gradients are averaged, the statistics of every normalisation are those of the whole batch, and what is computed once
+an outfit is computed for all outfits of the step in every process; so a run gives the losses and gradients of one
+process with the same batch, to rounding (with noise on the input: in distribution). NCCL serves CUDA, gloo the CPU.
 """
 
 from __future__ import annotations
@@ -71,6 +71,16 @@ def torchrun_team() -> Iterator[Team]:
         dist.destroy_process_group()
 
 
+def refuse_team(what: str) -> None:
+    """Ends a job that trains in one process where torchrun started several, before they meet in one folder.
+
+    Raises:
+        AvatarError: in every process of a team.
+    """
+    if current_team().size > 1:
+        raise AvatarError(f"{what}: expected one process, got {current_team().size}. Hint: start it without torchrun.")
+
+
 def average(tensors: list[Tensor], team: Team) -> None:
     """Replaces tensors by their mean over the team, in one exchange; every process gets the same bits."""
     if team.size == 1:
@@ -80,6 +90,14 @@ def average(tensors: list[Tensor], team: Team) -> None:
     flat /= team.size
     for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
         tensor.copy_(mean.view_as(tensor))
+
+
+def step_outfits(outfit_ids: Tensor, outfits: int, team: Team) -> Tensor:
+    """The outfits in any process's share of a step, ascending: own frames' ``(B,)`` to the team's ``(O,)``."""
+    seen = torch.zeros(outfits)
+    seen[outfit_ids.cpu()] = 1
+    average([seen], team)
+    return seen.nonzero()[:, 0].to(outfit_ids.device)
 
 
 def gradients_of(model: nn.Module) -> list[Tensor]:
@@ -165,12 +183,18 @@ class SharedNorm(_BatchNorm):
 
 
 def share_norms(model: nn.Module) -> None:
-    """Turns every batch normalisation of a model into a `SharedNorm`, in place; names and weights stay the same.
+    """Turns the batch normalisations of a model into `SharedNorm`s, in place; names and weights stay the same.
+
+    Those of its ``outfit_modules`` stay as they are: every process runs these modules on all outfits of the step
+    (`step_outfits`), so each has the whole batch's statistics by itself.
 
     Raises:
         AvatarError: for a kind of normalisation whose statistics it would not know how to share.
     """
-    for parent in list(model.modules()):
+    alike = getattr(model, "outfit_modules", ())
+    for path, parent in list(model.named_modules()):
+        if path.partition(".")[0] in alike:
+            continue
         for name, layer in parent.named_children():
             if not isinstance(layer, _BatchNorm) or isinstance(layer, SharedNorm):
                 continue

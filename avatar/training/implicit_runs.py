@@ -26,6 +26,7 @@ from avatar.training.building import building
 from avatar.training.canonical_runs import canonical_outfits, canonicalizer_folder
 from avatar.training.canonicalizing import CanonicalizeConfig, Skinning, load_canonicalizer
 from avatar.training.checkpoints import read_weights, write_weights
+from avatar.training.distributed import refuse_team
 from avatar.training.implicit_batches import CanonicalFrame, CanonicalFrames, canonical_frame
 from avatar.training.implicit_loop import ImplicitTrainConfig, ImplicitTrainer
 from avatar.training.runs import (
@@ -61,6 +62,7 @@ def train_implicit(config: RunConfig) -> Path:
         AvatarError: for unknown options, several outfits, or when the folder holds a run with other settings.
         DataError: when the canonicalizer or one of its scans is missing, naming the command that makes it.
     """
+    refuse_team(METHOD)
     settings = settings_from_dict(ScanimateConfig, config.method.settings, "method.settings.")
     config = replace(config, method=replace(config.method, settings=settings_to_dict(settings)))
     if len(config.outfit) != 1:

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import islice
 from pathlib import Path
@@ -21,7 +21,15 @@ from avatar.checks import AvatarError
 from avatar.nn.methods import draw_samples
 from avatar.records import Batch, LossTerms, SurfaceSamples
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
-from avatar.training.distributed import average, current_team, from_lead, gather, gradients_of, share_norms
+from avatar.training.distributed import (
+    average,
+    current_team,
+    from_lead,
+    gather,
+    gradients_of,
+    share_norms,
+    step_outfits,
+)
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
 from avatar.training.losses import TERMS, LossConfig, point_avatar_loss
@@ -201,6 +209,8 @@ class Trainer:
         for group, base in zip(self.optimiser.param_groups, self.base_rates):
             group["lr"] = base * factor
         before = [statistic.clone() for statistic in self.statistics]
+        if self.team.size > 1 and hasattr(self.model, "codes"):
+            batch = replace(batch, step_outfits=step_outfits(batch.outfit_ids, len(self.model.codes), self.team))
         terms = self.losses(batch.to(self.device), self.samples_at(self.step), self.progress())
         self.optimiser.zero_grad(set_to_none=True)
         terms.total.backward()
@@ -227,10 +237,13 @@ class Trainer:
         narrow = self.config.precision is Precision.bf16
         with torch.autocast(self.device.type, torch.bfloat16) if narrow else nullcontext():
             prediction = self.model(batch, samples)
-        if not prediction.points.is_cuda and not torch.isfinite(prediction.points).all():
-            undefined = prediction.points.sum() * math.nan  # as on CUDA, where neighbours of NaN are not refused
-            return LossTerms(dict.fromkeys(TERMS, undefined), {"points_to_scan": undefined})
-        return point_avatar_loss(prediction, batch, self.config.loss, progress)
+        if prediction.points.is_cuda or torch.isfinite(prediction.points).all():
+            return point_avatar_loss(prediction, batch, self.config.loss, progress)
+        # as on CUDA, where neighbours of NaN are not refused; by the same graph as in all processes, which wait for it
+        defined = replace(prediction, points=prediction.points.nan_to_num(0.0, 0.0, 0.0))
+        terms = point_avatar_loss(defined, batch, self.config.loss, progress)
+        parts = (terms.raw, terms.weighted)
+        return LossTerms(*({name: value * math.nan for name, value in part.items()} for part in parts))
 
     def rate_factor(self) -> float:
         """The learning rate's factor at this point of the budget."""

@@ -9,16 +9,27 @@ import torch
 from torch import nn
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from spheres import TEMPLATE, random_batch, small_config
+sys.path.insert(0, str(Path(__file__).parents[1] / "nn"))
+from cut_sphere import ATLASED
+from spheres import ENCODER, TEMPLATE, random_batch, small_config
 
-from avatar.nn.closet import ClosetAvatar
+from avatar.nn.baselines.pop import PopAvatar, PopConfig
+from avatar.nn.baselines.unet import UNetConfig
+from avatar.nn.closet import ClosetAvatar, ClosetConfig
+from avatar.nn.decoders import DecoderConfig
 from avatar.nn.pointnet2 import PointNorm
 from avatar.records import Batch
 from avatar.training.distributed import Team, current_team, gather, share_norms, torchrun_team
 from avatar.training.loop import TrainConfig, Trainer
-from avatar.training.losses import LossConfig
+from avatar.training.losses import LossConfig, point_avatar_loss
 
 FRAMES, ALL = 4, slice(None)
+SHARES = {  # outfits of the four frames of a step, of which each process has two
+    "each outfit in one process": (0, 0, 1, 1),
+    "both outfits in both processes": (0, 1, 1, 0),
+    "one outfit in both, one in one": (1, 0, 0, 0),
+    "one of the two outfits": (1, 1, 1, 1),
+}
 
 
 def part(batch: Batch, frames: slice = ALL) -> Batch:
@@ -80,11 +91,55 @@ def norm_errors(team: Team) -> list[float]:
     return errors
 
 
+def two_outfits(method: str) -> nn.Module:
+    """A small network of two outfits whose garment branch has normalisations; in training mode, double precision."""
+    torch.manual_seed(3)
+    decoder = DecoderConfig(width=16, trunk=1, branch=1)
+    if method == "closet":
+        return ClosetAvatar(TEMPLATE, 2, ClosetConfig(ENCODER, ENCODER, decoder, decoder, 6, code_std=1.0)).double()
+    config = PopConfig(UNetConfig(3, 4, 6), decoder, decoder, map_size=32, code_channels=5, code_std=1.0, template=True)
+    return PopAvatar(ATLASED, 2, config).double()
+
+
+def outfit_errors(folder: Path, team: Team) -> dict[str, float]:
+    """Largest differences of a team's gradients and statistics from those of one process, as shares of their norm."""
+    errors, loss = {}, LossConfig(normal_start=0.0, offset=20.0, wrinkle=20.0, wrinkle_normal=1.0, code=10.0)
+    config = TrainConfig(batch=FRAMES, points=60, scan_points=50, loss=loss)
+    for method in ("closet", "pop"):
+        for case, outfits in SHARES.items():
+            whole, alone = part(random_batch(FRAMES, outfits)), two_outfits(method)
+            trainer = Trainer(two_outfits(method), TEMPLATE.vertices, TEMPLATE.faces, config, folder)
+            terms, _, norm = trainer.train_step(part(whole, team.share(FRAMES)))
+            expected = point_avatar_loss(alone(whole, trainer.samples_at(0)), whole, loss, 0.0)
+            expected.total.backward()
+            logged = trainer.team_mean({name: float(value.detach()) for name, value in terms.raw.items()})
+            wanted, found = dict(alone.named_parameters()), dict(trainer.model.named_parameters())
+            length = torch.stack([parameter.grad.norm() for parameter in wanted.values()]).norm()
+            worst = {name: (found[name].grad - wanted[name].grad).norm() / length for name in wanted}
+            worst |= {name: abs(logged[name] - float(value.detach())) for name, value in expected.raw.items()}
+            for name, value in alone.named_buffers():
+                worst[name] = (trainer.model.get_buffer(name).double() - value).abs().max()
+            worst["norm"] = (norm - length).abs() / length
+            errors[f"{method}, {case}"] = max(float(error) for error in worst.values())
+    return errors
+
+
+def norms_after_a_bad_frame(folder: Path, team: Team) -> list[float]:
+    """Gradient norms of two steps of two outfits, the first with a body of one process that is not finite."""
+    whole, config = part(random_batch(FRAMES, (0, 1, 0, 1))), TrainConfig(batch=FRAMES, points=60, scan_points=50)
+    broken = replace(whole, vertices=whole.vertices.clone())
+    broken.vertices[-1] = torch.nan
+    trainer = Trainer(two_outfits("closet"), TEMPLATE.vertices, TEMPLATE.faces, config, folder)
+    return [float(trainer.train_step(part(batch, team.share(FRAMES)))[2]) for batch in (broken, whole)]
+
+
 def main(folder: Path, steps: int) -> None:
     with torchrun_team() as team:
         facts = {"rank": team.rank, "size": team.size}
         if team.size > 1 and steps == 20:
             facts["norms"] = norm_errors(team)
+            facts["outfits"] = outfit_errors(folder, team)
+            facts["bad"] = norms_after_a_bad_frame(folder, team)
         trainer = make_trainer(folder, steps)
         fit(trainer, team)
         weights = [float(value.double().sum()) for value in trainer.model.state_dict().values()]

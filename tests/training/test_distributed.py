@@ -1,6 +1,7 @@
 """Two processes under torchrun against one with the same batch: losses, weights, statistics, resuming."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -11,9 +12,12 @@ import torch
 from torch import nn
 
 from avatar.checks import AvatarError
+from avatar.training.canonicalizing import CanonicalizeConfig, train_canonicalizer
 from avatar.training.checkpoints import load_checkpoint
 from avatar.training.distributed import Team, average, current_team, from_lead, gather, share_norms, torchrun_team
+from avatar.training.implicit_runs import train_implicit
 from avatar.training.logs import read_log
+from avatar.training.runs import RunConfig
 
 SCRIPT = Path(__file__).parent / "team.py"
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(SCRIPT)]
@@ -53,12 +57,9 @@ def test_two_processes_give_the_losses_of_one(one, two):
     assert {key for key in expected if key[0] == "train"} == {("train", str(step)) for step in range(1, 21)}
     for row in together:
         if (row["split"], row["step"]) in expected:  # a first end of the budget adds a validation at step 12
-            # in validation the running variance tells: that of the garment branch, which runs in both processes, is
-            # corrected for twice the rows
-            error = 1e-5 if row["split"] == "train" else 1e-3
             for term in ("loss", "chamfer", "normal", "offset", "code", "grad_norm"):
                 wanted = expected[row["split"], row["step"]][term]
-                assert float(row[term] or 0) == pytest.approx(float(wanted or 0), rel=error), (row["step"], term)
+                assert float(row[term] or 0) == pytest.approx(float(wanted or 0), rel=1e-5), (row["step"], term)
 
 
 @pytest.mark.slow
@@ -80,6 +81,20 @@ def test_shared_norms_equal_those_of_the_whole_batch(two):
         assert max(facts(two, rank)["norms"]) < 2e-5
 
 
+@pytest.mark.slow
+def test_outfits_count_once_in_whatever_processes_they_are(two):
+    """Gradients, loss terms and running statistics of a step with two outfits are those of one process."""
+    for rank in (0, 1):
+        errors = facts(two, rank)["outfits"]
+        assert len(errors) == 8 and max(errors.values()) < 1e-5, errors
+
+
+@pytest.mark.slow
+def test_a_bad_frame_of_one_process_costs_all_the_step_and_no_more(two):
+    broken, sound = zip(*(facts(two, rank)["bad"] for rank in (0, 1)))
+    assert not any(map(math.isfinite, broken)) and sound[0] == sound[1] and math.isfinite(sound[0])
+
+
 def test_a_process_alone_is_a_team_of_one(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "1")
     monkeypatch.setenv("LOCAL_RANK", "0")
@@ -89,6 +104,14 @@ def test_a_process_alone_is_a_team_of_one(monkeypatch):
     values = [torch.tensor([2.0])]
     average(values, team)
     assert values[0] == 2 and gather("a", team) == ["a"] and from_lead("b", team) == "b"
+
+
+def test_what_trains_in_one_process_refuses_several(monkeypatch):
+    monkeypatch.setattr("avatar.training.distributed.current_team", lambda: Team(1, 2))
+    with pytest.raises(AvatarError, match=r"scanimate: expected one process, got 2.*without torchrun"):
+        train_implicit(RunConfig())
+    with pytest.raises(AvatarError, match=r"canonicalizer: expected one process, got 2.*without torchrun"):
+        train_canonicalizer(CanonicalizeConfig())
 
 
 def test_shares_cover_the_batch_and_must_be_even():

@@ -67,6 +67,8 @@ class PopAvatar(nn.Module):
     atlas, so features jump where the atlas is cut, however near two points are on the body.
     """
 
+    outfit_modules = ("garment_encoder", "garment_decoder")  # see `distributed.share_norms`
+
     def __init__(self, template: Template, outfits: int, config: PopConfig):
         """Builds the network on a body template with UV coordinates for a number of outfits."""
         super().__init__()
@@ -107,7 +109,8 @@ class PopAvatar(nn.Module):
         check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=len(self.vertices))
         if not (wrinkles or self.config.template):
             raise AvatarError("wrinkles: a model without explicit garment template has nothing else to predict.")
-        outfits, row = batch.outfit_ids.unique(return_inverse=True)
+        outfits = batch.outfits
+        row = torch.searchsorted(outfits, batch.outfit_ids)
         codes, uv = self.codes[outfits], self.atlas.place(samples)
         garment = self.garment_features(codes, uv)
         parts = []
