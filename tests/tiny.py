@@ -47,8 +47,8 @@ def tiny_pose(share: float) -> np.ndarray:
     return pose_from_angles(angles | {"trunk_bend": 20 * share}, 1)[0]
 
 
-def write_tiny_outfit(folder: Path) -> Path:
-    """Writes six train and three test frames of a tunic: trunk and hips of the body, pushed out 2 cm.
+def write_tiny_outfit(folder: Path, ease: float = EASE) -> Path:
+    """Writes six train and three test frames of a tunic: trunk and hips of the body, pushed out by ``ease`` metres.
 
     Its belly bulges in proportion to how far the pose has gone from `tiny_pose` 0 to 1, so a method that knows the
     pose does better than the best pose-independent garment; its lower half is a second garment. Skin under it
@@ -61,7 +61,7 @@ def write_tiny_outfit(folder: Path) -> Path:
     covered = (template.weights[:, trunk].sum(dim=1) > 0.6)[template.faces].all(dim=1)
     used, corners = torch.unique(template.faces[covered], return_inverse=True)
     outward = vertex_normals(template.vertices, template.faces)[used]
-    canonical = template.vertices[used] + EASE * outward
+    canonical = template.vertices[used] + ease * outward
     belly = torch.tensor([0.0, 0.28, 0.12])
     bulge = BULGE * torch.exp(-((canonical - belly) / 0.16).square().sum(dim=1, keepdim=True)) * outward
     labels = np.where(canonical[:, 1].numpy() > 0.25, 1, 2).astype(np.uint8)

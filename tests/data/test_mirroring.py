@@ -38,15 +38,18 @@ def test_mirroring_a_body_is_posing_it_mirrored():
     symmetry = mirror_map(body.template)
     torch.manual_seed(0)
     pose = 0.3 * torch.randn(2, 22, 3)
-    seen = mirror_batch(posed_batch(body, pose), torch.tensor([True, False]), symmetry)
-    expected = posed_batch(body, torch.cat([mirrored_pose(pose[:1], body.joint_names), pose[1:]]))
+    batch = posed_batch(body, pose)
+    seen = mirror_batch(batch, torch.tensor([True, False]), symmetry)
+    expected = posed_batch(body, mirrored_pose(pose, body.joint_names))
     for name, tolerance in (("vertices", 0.01), ("pose_vertices", 0.01), ("joint_transforms", 0.02)):
-        gap = (getattr(seen, name) - getattr(expected, name)).abs().flatten(1)
+        gap = (getattr(seen, name) - getattr(expected, name))[0].abs()
         assert gap.quantile(0.99) < tolerance, name
-    rotated = (seen.vertex_transforms - expected.vertex_transforms)[..., :3, :3].abs()
-    assert rotated.flatten().median() < 0.01
-    torch.testing.assert_close(seen.scan_points[0], posed_batch(body, pose).scan_points[0] * FLIP)
-    torch.testing.assert_close(seen.scan_normals[1], expected.scan_normals[1])
+    rotated = (seen.vertex_transforms - expected.vertex_transforms)[0].abs()
+    assert rotated[..., :3, :3].flatten().quantile(0.9) < 0.01 and rotated[..., 3].quantile(0.9) < 0.01
+    torch.testing.assert_close(seen.scan_points[0], batch.scan_points[0] * FLIP)
+    torch.testing.assert_close(seen.scan_normals[0], batch.scan_normals[0] * FLIP)
+    for name, value in vars(batch).items():  # the other frame is left as it was
+        assert not isinstance(value, torch.Tensor) or torch.equal(getattr(seen, name)[1], value[1]), name
 
 
 def test_mirroring_twice_gives_the_frame_back():

@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from avatar.checks import AvatarError
-from avatar.evaluation.comparison import Comparison
+from avatar.evaluation.comparison import PENETRATION_POINTS, Comparison
 from avatar.evaluation.metrics import METRICS, f_score, find_metrics, mean_acceleration, neighbour_spread, scan_to_discs
 from avatar.records import Mesh, PointCloud, Scan
 
@@ -152,6 +152,16 @@ def test_penetration_into_a_sphere(sphere_cloud):
     comparison = compare((points, normals), (points, normals), body=sphere_body(1.0))
     assert measure("penetration_share", comparison) == pytest.approx(0.35)
     assert measure("penetration_depth", comparison) == pytest.approx((500 * 0.01 + 200 * 0.03) / 700, abs=3e-4)
+
+
+def test_penetration_is_measured_all_over_a_large_prediction(sphere_cloud):
+    """Of more points than are tested a frame an even share is, not the first ones: they come patch by patch."""
+    points, normals = sphere_cloud(2 * PENETRATION_POINTS + 500, 1.05, 0)
+    points[-3000:] *= 0.95 / 1.05
+    comparison = compare((points, normals), (points[:9], normals[:9]), body=sphere_body(1.0))
+    assert PENETRATION_POINTS / 2 < len(comparison.depths) <= PENETRATION_POINTS
+    assert measure("penetration_share", comparison) == pytest.approx(3000 / len(points), abs=1e-3)
+    assert measure("penetration_depth", comparison) == pytest.approx(0.05, abs=1e-3)
 
 
 def test_no_penetration_outside_and_none_of_the_body_itself(sphere_cloud):

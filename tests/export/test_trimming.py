@@ -1,10 +1,10 @@
-"""Cutting surfaces along a line, and dropping small parts: closed forms on a flat grid."""
+"""Trimming to what points support, cutting along a line, dropping small parts: closed forms on a flat grid."""
 
 import numpy as np
 import pytest
 
-from avatar.export.trimming import cut_surface, drop_small_parts
-from avatar.records import Mesh
+from avatar.export.trimming import cut_surface, drop_small_parts, trim_surface
+from avatar.records import Mesh, PointCloud
 
 
 def grid(size=11):
@@ -19,6 +19,49 @@ def grid(size=11):
 def crosses(mesh):
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     return np.cross(b - a, c - a)
+
+
+def area(mesh):
+    return np.linalg.norm(crosses(mesh), axis=1).sum() / 2
+
+
+def trimmed(covered, max_hole=0.1, min_part=0.01):
+    """The unit square, cut to points 1 cm apart where ``covered(x, y)``."""
+    x, y = (np.arange(100) + 0.5) / 100, (np.arange(100) + 0.5) / 100
+    x, y = (values.reshape(-1) for values in np.meshgrid(x, y))
+    points = np.stack([x, y, 0 * x], axis=1)[covered(x, y)]
+    return trim_surface(grid(101), PointCloud(points, np.tile([0, 0, 1.0], (len(points), 1))), max_hole, min_part)
+
+
+def test_trimming_ends_the_surface_where_the_points_end():
+    half = trimmed(lambda x, y: x < 0.4)
+    assert half.vertices[:, 0].max() == pytest.approx(0.4, abs=0.01)
+    assert area(half) == pytest.approx(0.4, abs=0.01)
+    assert (crosses(half)[:, 2] > 0).all()
+    whole = trimmed(lambda x, y: x < 2)
+    assert area(whole) == pytest.approx(1, abs=1e-9)  # the border of the mesh is no rim to cut along
+    sparse = trimmed(lambda x, y: (x < 0.4) & (np.floor(100 * x) % 3 == 0) & (np.floor(100 * y) % 3 == 0), max_hole=0)
+    assert area(sparse) == pytest.approx(0.4, abs=0.03)  # wider gaps than max_hole, but nothing else is there
+
+
+def test_trimming_opens_gaps_wider_than_the_largest_hole():
+    def gap(x, y):
+        return np.hypot(x - 0.5, y - 0.5) > 0.1
+
+    assert area(trimmed(gap, max_hole=0.25)) == pytest.approx(1, abs=1e-9)
+    opened = trimmed(gap, max_hole=0.05)
+    assert area(opened) == pytest.approx(1 - np.pi * 0.1**2, abs=0.006)
+    inside = np.hypot(*(opened.vertices[:, :2] - 0.5).T)
+    assert inside.min() == pytest.approx(0.1, abs=0.015)
+
+
+def test_trimming_drops_parts_below_the_smallest_share():
+    def islands(x, y):
+        return (x < 0.6) | ((x > 0.8) & (y < 0.2))
+
+    assert area(trimmed(islands, min_part=0.01)) == pytest.approx(0.6 + 0.04, abs=0.015)
+    alone = trimmed(islands, min_part=0.1)
+    assert area(alone) == pytest.approx(0.6, abs=0.01) and alone.vertices[:, 0].max() < 0.62
 
 
 @pytest.mark.parametrize(("slope", "offset"), [((1, 0), 0.33), ((0.6, 0.8), 0.71), ((-0.3, 1), 0.25)])

@@ -77,6 +77,44 @@ def test_template_is_one_for_all_poses_and_differs_by_outfit():
     torch.testing.assert_close(template.offsets[0], resting + prediction.garment_offsets[0])
 
 
+def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
+    """CloSET eq. 3, frame by frame; outfits that are neither all there nor in their order, and codes that matter."""
+    torch.manual_seed(0)
+    model = ClosetAvatar(TEMPLATE, 3, small_config(code_std=1.0)).eval()
+    batch, samples = replace(random_batch(), outfit_ids=torch.tensor([2, 1, 2])), template_points()
+    prediction = model(batch, samples)
+    scale, skin = model.config.offset_scale, interpolate(model.skin_normals, samples)
+    for frame, outfit in enumerate(batch.outfit_ids):
+        garment = model.surface_features(model.codes[None, outfit], samples)
+        pose = interpolate(model.pose_encoder(batch.pose_vertices[None, frame]), samples)
+        template, wrinkles = model.garment_decoder(garment), model.pose_decoder(torch.cat([pose, garment], dim=-1))
+        expected = {
+            "garment_offsets": template.offsets * scale,
+            "wrinkle_offsets": wrinkles.offsets * scale,
+            "wrinkle_normals": wrinkles.normals,
+        }
+        for name, value in expected.items():
+            torch.testing.assert_close(getattr(prediction, name)[frame], value[0], rtol=1e-4, atol=1e-6)
+        added = (skin + template.normals + wrinkles.normals)[0] @ batch.vertex_transforms[frame, 0, :3, :3].T
+        torch.testing.assert_close(prediction.normals[frame], torch.nn.functional.normalize(added, dim=-1))
+    torch.testing.assert_close(prediction.codes, model.codes[1:])  # each outfit of the batch once
+
+
+def test_the_garment_template_is_the_prediction_at_rest_without_wrinkles():
+    batch, samples = random_batch(), template_points()
+    resting = TEMPLATE.vertices.expand(3, -1, -1)
+    rest = replace(batch, vertices=resting, vertex_transforms=torch.eye(4).expand(3, len(TEMPLATE.vertices), 4, 4))
+    model = avatar(code_std=1.0)
+    expected = model(rest, samples, wrinkles=False)
+    for frame, outfit in enumerate(batch.outfit_ids.tolist()):
+        template = model.garment_template(outfit, samples)
+        torch.testing.assert_close(template.offsets[0], expected.points[frame])
+        torch.testing.assert_close(template.normals[0], expected.normals[frame])
+    bare = silence(model).garment_template(0, samples).normals  # a correction of the body's own
+    skin = torch.nn.functional.normalize(interpolate(TEMPLATE.vertices, samples), dim=-1)
+    assert ((bare[0] * skin).sum(dim=-1) > 0.98).all()
+
+
 def test_static_floor_ignores_the_pose_and_csf_has_no_template():
     batch, samples = random_batch(), template_points()
     static = avatar(pose=False)
@@ -184,6 +222,18 @@ def test_the_field_is_asked_at_the_offset_point_and_moves_points_and_normals():
     skin = interpolate(body.template.vertices, samples).expand(2, -1, -1)
     elsewhere = model.skinning(skin, batch.joint_transforms, batch.outfit_ids)
     assert (transform_points(elsewhere, resting) - prediction.points).abs().max() > 1e-3
+
+
+def test_learned_skinning_starts_from_each_subject_s_own_body_not_from_the_mean():
+    """A network of several outfits is built on their mean body; what is posed is each subject's own."""
+    bodies, samples = [open_body(shape) for shape in ("female", "male")], vertex_samples(torch.arange(0, 12272, 23))
+    templates = [body.template for body in bodies]
+    mean = replace(templates[0], vertices=(templates[0].vertices + templates[1].vertices) / 2)
+    model = ClosetAvatar(mean, 2, small_config(skinning=Skinning.learned)).eval()
+    model.skin_with(LearnedSkinning([BodyField(template) for template in templates], templates))
+    batch = posed_batch(bodies, [1, 0, 1])
+    found = silence(model)(batch, samples).points
+    torch.testing.assert_close(found, interpolate(batch.vertices, samples), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("train_field", [True, False])

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from reference import ball_loop
 from spheres import sphere_template
 
 from avatar.body.open import open_body
@@ -38,6 +39,16 @@ def test_levels_are_nested_and_interpolation_weights_follow_inverse_squares():
     assert (coarse.up_weights.sum(dim=1) - 1).abs().max() < 1e-6
 
 
+def test_groups_are_the_balls_of_each_level_s_radius():
+    """More neighbours are allowed than the balls hold, so that it is the radius that ends them."""
+    points, sizes = sphere_template().vertices, HierarchyConfig((40, 10), (0.45, 1.3), 60)
+    levels = build_levels(points, sizes)
+    for level, radius in zip(levels, sizes.radii):
+        slow = ball_loop(level.positions.numpy(), level.finer_positions.numpy(), radius, level.groups.shape[1])
+        assert [set(group) for group in level.groups.tolist()] == [set(group) for group in slow]
+        assert max(len(set(group)) for group in slow) < level.groups.shape[1]  # no ball is full
+
+
 def test_set_abstraction_equals_the_layer_applied_to_every_neighbour():
     torch.manual_seed(0)
     level = build_levels(sphere_template().vertices, SIZES)[0]
@@ -61,7 +72,7 @@ def test_groups_are_rows_of_the_finer_level():
 def test_feature_propagation_equals_the_layers_on_interpolated_and_own_features():
     torch.manual_seed(0)
     level = build_levels(sphere_template().vertices.double(), SIZES)[0]
-    layer = FeaturePropagation(level, 4, 2, (6, 5)).double()
+    layer = FeaturePropagation(level, 4, 2, (6, 5)).double().eval()  # in training a norm hides scale and bias
     coarse, fine = torch.randn(2, 40, 4).double(), torch.randn(2, 162, 2).double()
     spread = (coarse[:, level.up_ids] * level.up_weights[..., None]).sum(dim=2)
     torch.testing.assert_close(layer(coarse, fine), layer.mlp(torch.cat([spread, fine], dim=-1)))

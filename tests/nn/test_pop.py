@@ -153,6 +153,39 @@ def test_frames_do_not_see_each_other_and_pose_and_outfit_matter():
     torch.testing.assert_close(second.offsets[::2], others.offsets[::2], rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("template", [False, True])
+def test_each_frame_is_decoded_from_its_own_outfit_and_pose(template):
+    """CloSET eq. 3 frame by frame; outfits that are neither all there nor in their order."""
+    torch.manual_seed(0)
+    config = replace(avatar().config, code_std=1.0, template=template)
+    model = PopAvatar(ATLASED, 3, config).eval()
+    batch, samples = replace(random_batch(), outfit_ids=torch.tensor([2, 1, 2])), template_points()
+    prediction, uv = model(batch, samples), model.atlas.place(samples)
+    for frame, outfit in enumerate(batch.outfit_ids):
+        garment = model.garment_features(model.codes[None, outfit], uv)
+        pose = look_up(model.pose_encoder(model.atlas.position_map(batch.pose_vertices[None, frame])), uv)
+        decoded = model.pose_decoder(torch.cat([pose, garment], dim=-1))
+        offsets = decoded.offsets[0] * config.offset_scale
+        if template:
+            torch.testing.assert_close(prediction.wrinkle_offsets[frame], offsets, rtol=1e-4, atol=1e-6)
+            torch.testing.assert_close(prediction.wrinkle_normals[frame], decoded.normals[0], rtol=1e-4, atol=1e-5)
+            offsets = offsets + model.garment_decoder(garment).offsets[0] * config.offset_scale
+        torch.testing.assert_close(prediction.offsets[frame], offsets, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(prediction.codes, model.codes[1:])  # each outfit of the batch once
+
+
+def test_the_garment_template_is_the_prediction_at_rest_without_wrinkles():
+    batch, samples = random_batch(), template_points()
+    resting = ATLASED.vertices.expand(3, -1, -1)
+    rest = replace(batch, vertices=resting, vertex_transforms=torch.eye(4).expand(3, resting.shape[1], 4, 4))
+    model = avatar(template=True)
+    expected = model(rest, samples, wrinkles=False)
+    for frame, outfit in enumerate(batch.outfit_ids.tolist()):
+        template = model.garment_template(outfit, samples)
+        torch.testing.assert_close(template.offsets[0], expected.points[frame])
+        torch.testing.assert_close(template.normals[0], expected.normals[frame])
+
+
 def test_garment_map_is_smoothed_without_a_nonlinearity():
     model = avatar()
     a, b = torch.randn(2, 1, 5, 32, 32)

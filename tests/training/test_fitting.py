@@ -1,19 +1,25 @@
 """An unseen outfit: only its code is learned, and it comes nearer to the scan than the mean outfit."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from spheres import TEMPLATE, random_batch, small_config
+from tiny import SETTINGS, quick_training, write_tiny_outfit
 
 from avatar.checks import AvatarError
+from avatar.data.layouts import find_outfit
+from avatar.data.splits import SplitConfig
 from avatar.geometry.surface import sample_surface
 from avatar.nn.closet import ClosetAvatar, Skinning
 from avatar.training import fitting
 from avatar.training.fitting import FitConfig, fit_code, fit_outfit
 from avatar.training.losses import LossConfig, point_avatar_loss
-from avatar.training.runs import RunConfig, TrainedAvatar
+from avatar.training.prediction import body_batch, predict, template_samples
+from avatar.training.runs import MethodChoice, RunConfig, TrainedAvatar, load_run, train_run
 
 
 def test_only_the_code_is_learned_and_it_fits_the_scan():
@@ -40,6 +46,61 @@ def test_only_the_code_is_learned_and_it_fits_the_scan():
     model.codes.data = mean.data
     assert fitted < 0.5 * distance()
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items() if name != "codes")
+
+
+def test_rates_of_the_code_fall_for_the_second_half(monkeypatch):
+    torch.manual_seed(0)
+    model, seen = ClosetAvatar(TEMPLATE, 2, small_config(code_std=1.0)), []
+
+    def watch(prediction, *rest):
+        seen.append(model.codes.detach().clone())
+        return point_avatar_loss(prediction, *rest)
+
+    monkeypatch.setattr(fitting, "point_avatar_loss", watch)
+    avatar = TrainedAvatar(model, TEMPLATE, RunConfig(), 0, 0.0)
+    seen.append(fit_code(avatar, random_batch(1), FitConfig(steps=8, code_lr=1e-3, points=300)))
+    moved = [float((after - before).abs().max()) for before, after in pairwise(seen)]
+    assert moved[0] == pytest.approx(1e-3, rel=1e-3)  # Adam's first step is as long as the rate
+    assert all(move > 5e-4 for move in moved[:4]) and all(move < 2e-4 for move in moved[4:])
+
+
+@pytest.fixture(scope="module")
+def wardrobe(tmp_path_factory) -> Path:
+    """A data folder: one garment in three widths, the third like the second."""
+    root = tmp_path_factory.mktemp("wardrobe")
+    for name, ease in (("tight", 0.005), ("wide", 0.06), ("unseen", 0.055)):
+        write_tiny_outfit(root / "open" / name, ease)
+    return root
+
+
+def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_poses(wardrobe, tmp_path):
+    train = quick_training(steps=80, points=1500, scan_points=1500, validate_every=1000)
+    where = {"dataset": "open", "data_root": wardrobe, "runs_root": tmp_path}
+    choice = MethodChoice("closet", "closet", SETTINGS)
+    run = train_run(RunConfig(choice, outfit=("tight", "wide"), train=train, split=SplitConfig(0.0), **where))
+    loss = LossConfig(normal_start=0.0, offset=20)
+    options = {"steps": 60, "code_lr": 2e-2, "points": 3000, "scan_points": 3000, "loss": loss}
+    folder = fit_outfit(FitConfig(run=run, outfit="unseen", **options, **where))
+    base, fitted = load_run(run), load_run(folder)
+    assert (folder.parents[2].name, fitted.config.outfit, fitted.steps) == ("closet-fitted", ("unseen",), 60)
+    for name, value in base.model.state_dict().items():
+        assert name == "codes" or torch.equal(value, fitted.model.state_dict()[name]), name
+    assert len(fitted.model.codes) == 1
+
+    outfit = find_outfit(wardrobe, "open", "unseen", fitted.config.scan)
+
+    def error(avatar: TrainedAvatar, code: torch.Tensor) -> float:
+        avatar.model.codes = torch.nn.Parameter(code[None])
+        samples, errors = template_samples(avatar, 3000), []
+        for name in outfit.frames("test"):
+            frame = outfit.load("test", name)
+            cloud = predict(avatar.model, body_batch([frame.body], 0, (name,)), samples)
+            errors.append(float(cKDTree(cloud.points).query(frame.scan.points)[0].mean()))
+        return sum(errors) / len(errors)
+
+    codes = base.model.codes.detach()
+    tight, start = (error(base, code) for code in (codes[0], codes.mean(dim=0)))
+    assert error(fitted, fitted.model.codes[0].detach()) < 0.7 * min(tight, start)
 
 
 def test_another_wearer_s_field_is_not_fitted(monkeypatch):

@@ -18,7 +18,7 @@ from avatar.training.checkpoints import load_checkpoint
 from avatar.training.locks import HELD, lock_folder
 from avatar.training.logs import read_log
 from avatar.training.loop import Schedule, TrainConfig, Trainer
-from avatar.training.losses import TERMS, LossConfig
+from avatar.training.losses import TERMS, LossConfig, point_avatar_loss
 from avatar.training.signals import Stopped
 
 
@@ -169,6 +169,55 @@ def test_normals_are_not_trained_before_their_term_starts(tmp_path):
         trainer.train_step(random_batch())
         moved = not all(torch.equal(value, old) for value, old in zip(last, before))
         assert moved == (step >= 5)
+
+
+def changes(trainer: Trainer) -> dict[str, float]:
+    """The longest way that one training step moves a number of each parameter."""
+    after = list(trainer.model.named_parameters())
+    before = [value.detach().clone() for _, value in after]
+    trainer.train_step(random_batch())
+    return {name: float((value.detach() - was).abs().max()) for (name, value), was in zip(after, before)}
+
+
+def test_codes_and_networks_move_at_their_own_rates(tmp_path):
+    """Adam's first step is as long as the rate wherever there is a gradient; both rates warm up."""
+    moved = changes(make_trainer(tmp_path, lr=1e-2, code_lr=3e-4, warmup=4))
+    assert moved.pop("codes") == pytest.approx(3e-4 / 4, rel=1e-3)
+    assert max(moved.values()) == pytest.approx(1e-2 / 4, rel=1e-3)
+
+
+def test_clipping_shortens_the_gradient_before_the_step_and_logs_it_unclipped(tmp_path):
+    all_terms = LossConfig(normal_start=0.0)  # every parameter has a gradient
+    free, clipped = make_trainer(tmp_path, loss=all_terms), make_trainer(tmp_path, clip=1e-9, loss=all_terms)
+    norms = [float(trainer.train_step(random_batch())[2]) for trainer in (free, clipped)]
+    assert norms[0] == norms[1] > 1e-3
+    gradients = [[value.grad for value in trainer.model.parameters()] for trainer in (free, clipped)]
+    assert float(torch.cat([g.flatten() for g in gradients[1]]).norm()) == pytest.approx(1e-9, rel=1e-2)
+    for whole, short in zip(*gradients):
+        torch.testing.assert_close(short, whole * (1e-9 / norms[0]), rtol=1e-2, atol=1e-13)
+    assert max(changes(make_trainer(tmp_path, clip=1e-9)).values()) < 1e-3  # a tenth of the rate: the step was short
+
+
+def test_validation_asks_the_evaluated_network_and_leaves_it_as_it_was(tmp_path):
+    trainer = make_trainer(tmp_path)
+    trainer.train_step(random_batch())
+    before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
+    larger = random_batch()
+    batches = [random_batch(2), replace(larger, scan_points=3 * larger.scan_points)]
+    values = trainer.validate(batches)
+    assert all(torch.equal(value, before[name]) for name, value in trainer.model.state_dict().items())
+    model, expected = trainer.model.eval(), dict.fromkeys(("loss", "chamfer", "normal"), 0.0)
+    for batch in batches:
+        terms = point_avatar_loss(model(batch, trainer.samples_at(-1)), batch, trainer.config.loss, 1.0)
+        raw, share = terms.raw, len(batch.names) / 5  # a mean over frames, not over batches
+        expected["loss"] += share * float(terms.total)
+        expected["chamfer"] += share * float(raw["scan_to_points"] + raw["points_to_scan"])
+        expected["normal"] += share * float(raw["normal"])
+    assert {name: values[name] for name in expected} == pytest.approx(expected, rel=1e-5)
+    assert trainer.validate(iter(())) == {}
+    trainer.train_step(random_batch())  # goes on as training: running statistics move
+    running = [name for name in before if name.endswith("running_mean")]
+    assert not any(torch.equal(trainer.model.state_dict()[name], before[name]) for name in running)
 
 
 def test_template_points_are_fixed_or_fresh(tmp_path):

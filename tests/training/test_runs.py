@@ -9,11 +9,16 @@ from scipy.spatial import cKDTree
 from tiny import SETTINGS, quick_training
 
 from avatar.checks import AvatarError, DataError
+from avatar.data.mirroring import mirror_batch, mirror_map
 from avatar.data.splits import SplitConfig
 from avatar.io.points import read_points
 from avatar.simulate.sequences import authored_motion
+from avatar.training.loop import Trainer
 from avatar.training.prediction import body_batch, predict, predict_frames, predict_motion, template_samples
 from avatar.training.runs import MethodChoice, RunConfig, choose_device, load_run, train_run
+
+POSE = ("pose_vertices", "vertices", "vertex_transforms", "joint_transforms")
+TENSORS = (*POSE, "scan_points", "scan_normals", "outfit_ids")
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +103,29 @@ def test_damaged_and_unfinished_runs_are_refused(trained, tmp_path):
     (copy / "avatar.safetensors").write_bytes(b"x" * 100)
     with pytest.raises(DataError, match="sha256"):
         load_run(copy)
+
+
+def test_a_mirroring_run_learns_from_half_of_its_frames_in_a_mirror(settings, tiny_outfit, monkeypatch):
+    """Through `train_run`: what the network sees of the pose and what it is compared with, both or neither."""
+    drawn = {}
+
+    def note(trainer, batch_at, epoch_length, validation):
+        drawn[trainer.config.mirror] = [batch_at(step) for step in range(6)], list(validation())
+
+    monkeypatch.setattr(Trainer, "fit", note)
+    for mirror in (False, True):
+        train_run(replace(settings, name=f"mirror-{mirror}", train=replace(settings.train, mirror=mirror, seed=2)))
+    symmetry, seen = mirror_map(tiny_outfit.template), []
+    for before, after in zip(drawn[False][0], drawn[True][0]):
+        image = mirror_batch(before, torch.tensor([True, True]), symmetry)
+        for row in range(2):
+            seen.append(not torch.equal(before.scan_points[row], after.scan_points[row]))
+            source = image if seen[-1] else before
+            for field in TENSORS:
+                assert torch.equal(getattr(after, field)[row], getattr(source, field)[row]), field
+    assert 3 <= sum(seen) <= 9 and seen[::2] != seen[1::2]
+    for before, after in zip(drawn[False][1], drawn[True][1], strict=True):  # what is held back is left as it is
+        assert all(torch.equal(getattr(before, field), getattr(after, field)) for field in TENSORS)
 
 
 def test_point_counts_and_outfits_out_of_range_are_refused(settings, tiny_outfit):
