@@ -15,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import INSTALL_LINES, AvatarError, DataError, check_finite, check_shape, require
+from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
 from avatar.export.poisson import FAILED, READY, SOLVED, serve
 from avatar.export.trimming import trim_surface
+from avatar.invocation import install_line
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import FORMATS, check_mesh, write_mesh
 from avatar.io.points import read_points
@@ -166,11 +167,11 @@ class PoissonMesher:
             self.close()
             raise AvatarError(
                 "the meshing process died while importing open3d. A script that meshes needs "
-                f"'if __name__ == \"__main__\":'; otherwise run: {INSTALL_LINES['open3d']}"
+                f"'if __name__ == \"__main__\":'; otherwise run: {install_line('open3d')}"
             ) from error
         if reason:
             self.close()
-            raise AvatarError(f"open3d cannot be imported ({reason}). Run: {INSTALL_LINES['open3d']}")
+            raise AvatarError(f"open3d cannot be imported ({reason}). Run: {install_line('open3d')}")
 
 
 def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndarray]:
