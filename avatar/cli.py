@@ -15,11 +15,9 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-from avatar.invocation import CORE, activation_line, checkout, command_line, install_line
+from avatar.invocation import CORE, PIPE_CLOSED, STOPPED, activation_line, checkout, command_line, install_line
 from avatar.verbs import VERBS, resolve
 
-STOPPED = 75  # EX_TEMPFAIL: stopped by a signal; the same command goes on
-PIPE_CLOSED = 141  # as a shell reports a process that SIGPIPE ended
 OLDEST = (3, 11)
 
 

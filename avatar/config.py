@@ -11,6 +11,7 @@ import logging
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from datetime import datetime
@@ -29,8 +30,11 @@ from omegaconf.errors import OmegaConfBaseException
 from avatar.environment import prepare_process  # isort: skip
 from avatar.arguments import explain, refuse_code, tidy_arguments
 from avatar.checks import AvatarError
-from avatar.cli import PIPE_CLOSED, STOPPED, refuse, silence_closed_streams
+from avatar.cli import refuse, silence_closed_streams
+from avatar.invocation import PIPE_CLOSED, STOPPED
+from avatar.pipeline.endings import report_ending
 from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
+from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.distributed import current_team, torchrun_team
 from avatar.training.signals import Stopped, leave_when_asked
@@ -39,6 +43,7 @@ from avatar.verbs import VERBS, resolve
 CONF = Path(__file__).parents[1] / "conf"
 METHOD_SETTINGS = "avatar.pipeline.methods:SETTINGS"
 Settings = TypeVar("Settings")
+report = logging.getLogger(__name__)
 
 
 def settings_class(verb: str) -> type:
@@ -117,8 +122,9 @@ def conclude(verb: str, outcomes: list[Outcome]) -> int:
     code = 2 if states else 0
     finished = [outcome.settings for outcome in outcomes if outcome.state == State.finished.value]
     if VERBS[verb].then and finished:
+        jobs = [settings_from_dict(settings_class(verb), settings) for settings in finished]
         try:
-            resolve(VERBS[verb].then)([settings_from_dict(settings_class(verb), settings) for settings in finished])
+            report.info("%s: %s", verb, resolve(VERBS[verb].then)(jobs))
         except AvatarError as error:
             code = refuse(verb, error)
     return code
@@ -152,9 +158,12 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
     try:
         settings = to_settings(settings_class(verb), config)
         with leave_when_asked():
-            run(settings)
+            WORK.clear()
+            started = time.monotonic()
+            result = run(settings)
+            report_ending(verb, settings, result, time.monotonic() - started)
             if VERBS[verb].then and not several and current_team().leads:
-                resolve(VERBS[verb].then)([settings])
+                report.info("%s: %s", verb, resolve(VERBS[verb].then)([settings]))
     except Stopped as stopped:
         return end(State.stopped, str(stopped), STOPPED)
     except SystemExit as leaving:

@@ -6,6 +6,7 @@ The standard library alone, for what it prints is needed most where nothing else
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import re
 import shlex
 import shutil
@@ -13,6 +14,8 @@ import sys
 from pathlib import Path
 
 DISTRIBUTION = "clothed-avatar"  # on a package index; `avatar` belongs to somebody else there
+STOPPED = os.EX_TEMPFAIL  # exit code 75: stopped by a signal, nothing is wrong, the same command goes on
+PIPE_CLOSED = 128 + 13  # as a shell reports a process that SIGPIPE ended: the reader of the output has left
 PACKAGE = Path(__file__).resolve().parent
 CORE = ("torch", "numpy", "scipy", "trimesh", "roma", "hydra", "tqdm", "safetensors", "matplotlib", "skimage")
 EXTRAS = {
