@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from avatar.invocation import install_line
+
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # of what becomes a file or folder of ours
-INSTALL_LINES = {
-    "open3d": "pip install 'avatar[mesh]' and, on Debian or Ubuntu, "
-    "apt-get install -y libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0",
-    "newton": "pip install 'avatar[simulate]'",
-    "warp": "pip install 'avatar[simulate]'",
-    "anny": "pip install 'avatar[anny]'",
-    "pyvista": "pip install 'avatar[pictures]' and, on Debian or Ubuntu, apt-get install -y libgl1 libegl1",
-    "pygltflib": "pip install 'avatar[export]'",
-    "pxr": "pip install 'avatar[export]'",
-    "tensorboard": "pip install 'avatar[log]'",
-}
 
 
 class AvatarError(ValueError):
@@ -33,7 +26,40 @@ class DataError(AvatarError):
 
     def __init__(self, path: str | Path, problem: str, mend: str = ""):
         self.path = Path(path)
-        super().__init__(f"{path}: {problem}" + (f" {mend}" if mend else ""))
+        super().__init__(sentences(f"{path}: {problem}", mend, nearest_folder(self.path)))
+
+
+def sentences(*parts: str) -> str:
+    """A message of those of its parts that are not empty."""
+    return " ".join(filter(None, parts))
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The known word nearest to one that is not known, as a question; empty where none is near."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f"Did you mean {near[0]!r}?" if near else ""
+
+
+def unknown_name(what: str, word: str, known: Iterable[str]) -> AvatarError:
+    """The error of an option ``what`` whose value is none of the known names."""
+    known = list(known)
+    message = f"{what}: expected one of {', '.join(known)}, got {word!r}."
+    return AvatarError(sentences(message, did_you_mean(word, known)))
+
+
+def nearest_folder(path: Path) -> str:
+    """The folder that a mistyped path may have meant, as a question; empty where none is near or nothing is wrong."""
+    wanted = path.parent
+    if wanted.exists():
+        return ""
+    there = next(parent for parent in wanted.parents if parent.exists())
+    for part in wanted.relative_to(there).parts:
+        names = [folder.name for folder in there.iterdir() if folder.is_dir()] if there.is_dir() else []
+        near = [part] if part in names else difflib.get_close_matches(part, names, n=1)
+        if not near:
+            return ""
+        there = there / near[0]
+    return f"Did you mean {str(there)!r}?"
 
 
 def check_name(what: str, name: str) -> str:
@@ -109,5 +135,5 @@ def require(package: str) -> ModuleType:
     try:
         return importlib.import_module(package)
     except (ImportError, OSError) as error:
-        line = INSTALL_LINES.get(package.split(".")[0], f"pip install {package}")
+        line = install_line(package.partition(".")[0])
         raise AvatarError(f"{package} is needed here and cannot be imported ({error}). Run: {line}") from error

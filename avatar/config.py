@@ -7,11 +7,11 @@ a config never names code.
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
-import re
+import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from datetime import datetime
@@ -21,59 +21,41 @@ from typing import Any, TypeVar
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 # First of all: it says how threads wait, which torch reads when it is imported.
 from avatar.environment import prepare_process  # isort: skip
-from avatar.checks import AvatarError, DataError
-from avatar.io.documents import check_events, read_yaml
-from avatar.pipeline.benchmarks.bench import BenchConfig
-from avatar.pipeline.comparison import CompareConfig
-from avatar.pipeline.demo import DemoConfig
-from avatar.pipeline.experiments import ExperimentConfig
-from avatar.pipeline.methods import SETTINGS
-from avatar.pipeline.outcomes import State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
-from avatar.pipeline.reporting import ReportConfig
-from avatar.pipeline.scores import EvaluateConfig, PredictConfig
-from avatar.pipeline.seams import SeamsConfig
-from avatar.pipeline.surfaces import ExportConfig, MeshConfig
-from avatar.pipeline.torture.trials import TortureConfig
+from avatar.arguments import explain, refuse_code, tidy_arguments
+from avatar.checks import AvatarError
+from avatar.cli import refuse, silence_closed_streams
+from avatar.invocation import PIPE_CLOSED, STOPPED
+from avatar.pipeline.endings import report_ending
+from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
+from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.simulate.recording import SimulateConfig
-from avatar.training.canonicalizing import CanonicalizeConfig
 from avatar.training.distributed import current_team, torchrun_team
-from avatar.training.fitting import FitConfig
-from avatar.training.runs import RunConfig
-from avatar.training.signals import STOPPED, Stopped, leave_when_asked
+from avatar.training.signals import Stopped, leave_when_asked
+from avatar.verbs import VERBS, resolve
 
 CONF = Path(__file__).parents[1] / "conf"
-VERBS = {
-    "canonicalize": CanonicalizeConfig,
-    "train": RunConfig,
-    "fit": FitConfig,
-    "predict": PredictConfig,
-    "evaluate": EvaluateConfig,
-    "compare": CompareConfig,
-    "experiment": ExperimentConfig,
-    "mesh": MeshConfig,
-    "export": ExportConfig,
-    "report": ReportConfig,
-    "seams": SeamsConfig,
-    "demo": DemoConfig,
-    "simulate": SimulateConfig,
-    "torture": TortureConfig,
-    "bench": BenchConfig,
-}
+METHOD_SETTINGS = "avatar.pipeline.methods:SETTINGS"
 Settings = TypeVar("Settings")
+report = logging.getLogger(__name__)
 
 
-def register() -> None:
-    """Stores the defaults of every verb's and every method's settings under ``<name>_defaults``."""
-    store = ConfigStore.instance()
-    for verb, kind in VERBS.items():
-        store.store(name=f"{verb}_defaults", node=settings_to_dict(kind()))
-    for name, kind in SETTINGS.items():
+def settings_class(verb: str) -> type:
+    """The class of a verb's settings."""
+    return resolve(VERBS[verb].settings)
+
+
+def register(verb: str) -> None:
+    """Stores the defaults of a verb's settings, and of all methods' where it takes one, under ``<name>_defaults``."""
+    store, defaults = ConfigStore.instance(), settings_to_dict(settings_class(verb)())
+    store.store(name=f"{verb}_defaults", node=defaults)
+    for name, kind in resolve(METHOD_SETTINGS).items() if isinstance(defaults.get("method"), dict) else ():
         store.store(group="method", name=f"{name}_defaults", node={"settings": settings_to_dict(kind())})
 
 
@@ -85,108 +67,80 @@ def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
 
 def compose_settings(verb: str, *overrides: str) -> Any:
     """A verb's settings as the command line would give them with these overrides."""
-    register()
+    register(verb)
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return to_settings(VERBS[verb], hydra.compose(verb, list(overrides)))
+        return to_settings(settings_class(verb), hydra.compose(verb, list(overrides)))
 
 
-def refuse_code(arguments: list[str]) -> None:
-    """Refuses command lines by which a file could become code; what is typed on them is trusted, files are not.
-
-    Hydra makes objects of what its own options name (callbacks, launchers, log handlers). A folder of configuration
-    from elsewhere (``--config-dir``) may therefore set options of verbs and nothing of Hydra's, nor read the
-    environment, and the two options by which Hydra looks in further places are not taken.
-
-    Raises:
-        AvatarError: naming the option.
-        DataError: naming the file and the word in it.
-    """
-    for argument in arguments:
-        if argument.lstrip("+~").startswith("hydra.searchpath") or argument.startswith("--experimental-rerun"):
-            raise AvatarError(f"{argument.partition('=')[0]}: not taken here; use --config-dir with a folder of YAML.")
-    parser = argparse.ArgumentParser(add_help=False, exit_on_error=False)
-    for names in (("--config-dir", "-cd"), ("--config-path", "-cp")):
-        parser.add_argument(*names, dest="folders", action="append", default=[], type=Path)
-    for folder in parser.parse_known_args(arguments)[0].folders:
-        for path in sorted(folder.rglob("*.y*ml")):
-            refuse_machinery(path, path.relative_to(folder))
-
-
-def refuse_machinery(path: Path, name: Path) -> None:
-    """Refuses a configuration file that speaks of Hydra's own options, of objects, or of the environment.
-
-    Raises:
-        DataError: naming the file and the word in it.
-    """
-    read_yaml(path)
-    text = path.read_text(encoding="utf-8")
-    headers = [line for line in text.splitlines() if "@package" in line]
-    for word in (*check_events(path, text), *headers, str(name)):
-        if any(sign in word for sign in ("hydra", "_target_", "()")) or re.search(r"\$\{[^}]*:", word):
-            mend = "Options of verbs are all that a configuration from elsewhere may set."
-            raise DataError(path, f"{word!r:.100} could run code or read the environment: not read.", mend)
-
-
-def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], Any] | None = None) -> None:
-    """Runs a verb from the command line: composes its config, converts it, calls ``run`` with the settings.
+def command(verb: str, run: Callable[[Any], Any] | None = None) -> None:
+    """Runs a verb from the command line: composes its config, converts it, calls its function with the settings.
 
     Bad input ends in one line on standard error and exit code 2, not in a traceback; a signal that asks to stop in
     exit code 75 once all is saved. In a multirun, by whatever launcher, the other jobs go on after a failure; those
-    that did not finish are named with the reason at the end, and the exit code is 2. After that ``then`` is called
-    with the settings of the jobs that did finish, if any, unless the multirun was asked to stop.
+    that did not finish are named with the reason at the end, and the exit code is 2. After that the verb's ``then``
+    is called with the settings of the jobs that did finish, if any, unless the multirun was asked to stop.
+
+    Args:
+        verb: its name in `VERBS`.
+        run: another function than the verb's own.
     """
-    register()
     journal = Path("runs/multirun").absolute() / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{os.getpid()}"
     os.environ["AVATAR_MULTIRUN"] = str(journal)  # conf/hydra/quiet.yaml: the launchers' own files go there as well
-    parent = os.getpid()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on, instead of printing them its way
+    parent, run = os.getpid(), run or resolve(VERBS[verb].run)
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=verb)
     def main(config: DictConfig) -> None:
-        run_job(verb, run, config, journal, parent, then)
+        run_job(verb, run, config, journal, parent)
 
+    code = 0
     with torchrun_team() as team, leave_when_asked(lambda number: ask_to_stop(journal, number)):
-        logging.basicConfig(level=logging.INFO if team.leads else logging.WARNING, format="%(message)s")
-        code = 0
+        listen_to_verbs(logging.INFO if team.leads else logging.WARNING)
         try:
+            register(verb)
+            sys.argv[1:] = tidy_arguments(sys.argv[1:])
             refuse_code(sys.argv[1:])
             main()
         except SystemExit as leaving:
             code = leaving.code
+        except (HydraException, OmegaConfBaseException) as error:
+            code = refuse(verb, explain(error, verb, sys.argv[1:], CONF))
         except AvatarError as error:
-            print(f"{verb}: {error}", file=sys.stderr)
-            code = 2
-    outcomes = read_outcomes(journal)
-    if outcomes:
-        print(summarise(outcomes), file=sys.stderr)
+            code = refuse(verb, error)
+        outcomes = read_outcomes(journal)
+        if outcomes and code != PIPE_CLOSED:
+            code = conclude(verb, outcomes) or code
+    sys.exit(code)
+
+
+def conclude(verb: str, outcomes: list[Outcome]) -> int:
+    """Says what became of a multirun's jobs and calls the verb's ``then`` for those that finished; the exit code."""
+    print(summarise(outcomes), file=sys.stderr)
     states = {State(outcome.state) for outcome in outcomes} - {State.finished}
+    if State.stopped in states:
+        return STOPPED
+    code = 2 if states else 0
     finished = [outcome.settings for outcome in outcomes if outcome.state == State.finished.value]
-    if then is not None and finished and State.stopped not in states:
+    if VERBS[verb].then and finished:
+        jobs = [settings_from_dict(settings_class(verb), settings) for settings in finished]
         try:
-            then([settings_from_dict(VERBS[verb], settings) for settings in finished])
+            report.info("%s: %s", verb, resolve(VERBS[verb].then)(jobs))
         except AvatarError as error:
-            print(f"{verb}: {error}", file=sys.stderr)
-            code = code or 2
-    sys.exit(STOPPED if State.stopped in states else code or (2 if states else 0))
+            code = refuse(verb, error)
+    return code
 
 
-def run_job(
-    verb: str,
-    run: Callable[[Any], Any],
-    config: DictConfig,
-    journal: Path,
-    parent: int,
-    then: Callable[[list[Any]], Any] | None = None,
-) -> None:
+def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: Path, parent: int) -> None:
     """One job of a verb, in the ``parent`` process or in one that a launcher started.
 
-    In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. ``then`` follows a job
-    that is the only one.
+    In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. The verb's ``then``
+    follows a job that is the only one.
     """
     prepare_process()
-    logging.basicConfig(level=logging.INFO, format="%(message)s")  # what verbs report; conf/hydra keeps Hydra quiet
+    listen_to_verbs(logging.INFO)
     job = HydraConfig.get()
     several = job.mode is RunMode.MULTIRUN
-    name = " ".join([verb, *job.overrides.task])
+    name = " ".join([verb, *OmegaConf.to_container(job.overrides.task, resolve=False)])
 
     def end(state: State, why: str, code: int) -> None:
         print(f"{name}: {why}", file=sys.stderr)
@@ -202,11 +156,14 @@ def run_job(
     if several:
         note_outcome(journal, job.job.num, name, State.running)
     try:
-        settings = to_settings(VERBS[verb], config)
+        settings = to_settings(settings_class(verb), config)
         with leave_when_asked():
-            run(settings)
-            if then is not None and not several and current_team().leads:
-                then([settings])
+            WORK.clear()
+            started = time.monotonic()
+            result = run(settings)
+            report_ending(verb, settings, result, time.monotonic() - started)
+            if VERBS[verb].then and not several and current_team().leads:
+                report.info("%s: %s", verb, resolve(VERBS[verb].then)([settings]))
     except Stopped as stopped:
         return end(State.stopped, str(stopped), STOPPED)
     except SystemExit as leaving:
@@ -215,7 +172,11 @@ def run_job(
         return end(State.stopped, "stopped by a signal. The same command goes on with what is missing.", STOPPED)
     except AvatarError as error:
         return end(State.failed, str(error), 2)
+    except OmegaConfBaseException as error:
+        return end(State.failed, explain(error, verb, sys.argv[1:], CONF), 2)
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and silence_closed_streams():
+            sys.exit(PIPE_CLOSED)
         if not several:
             raise
         traceback.print_exc()
@@ -223,3 +184,19 @@ def run_job(
     if several:
         note_outcome(journal, job.job.num, name, State.finished, settings=settings_to_dict(settings))
     return None
+
+
+class Lines(logging.StreamHandler):
+    """What verbs report, a line each on standard error; a reader that leaves asks to stop, as a signal does."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Asks to stop where the reader has left; reports other failures as logging does."""
+        if isinstance(sys.exc_info()[1], BrokenPipeError) and silence_closed_streams():
+            signal.raise_signal(signal.SIGTERM)
+        else:
+            super().handleError(record)
+
+
+def listen_to_verbs(level: int) -> None:
+    """Prints what verbs report, from a level on; conf/hydra keeps Hydra quiet."""
+    logging.basicConfig(level=level, format="%(message)s", handlers=[Lines()])

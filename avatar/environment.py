@@ -12,7 +12,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
-from avatar.checks import INSTALL_LINES
+from avatar.invocation import CORE, DISTRIBUTIONS, install_line
 
 # Idle OpenMP threads look for work for some microseconds and then sleep. Where processes share cores, threads that spin
 # without end make a training step many times slower; threads that sleep at once have to be woken for each of its many
@@ -32,7 +32,6 @@ APT_PACKAGES = {
     "libgomp.so": "libgomp1",
     "libXrender.so": "libxrender1",
 }
-CORE = ("torch", "numpy", "scipy", "trimesh", "roma", "hydra", "tqdm", "safetensors", "matplotlib", "skimage")
 OPTIONAL = {
     "open3d": "meshing",
     "pyvista": "pictures",
@@ -42,7 +41,6 @@ OPTIONAL = {
     "newton": "simulating new outfits",
     "anny": "bodies of other shapes",
 }
-DISTRIBUTIONS = {"hydra": "hydra-core", "skimage": "scikit-image", "pxr": "usd-core", "open3d": "open3d-cpu"}
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ def mending_line(package: str, message: str) -> str:
     for stem, apt in APT_PACKAGES.items():
         if library and library.group(1).startswith(stem):
             return f"apt-get install -y {apt}"
-    return INSTALL_LINES.get(package, f"pip install {DISTRIBUTIONS.get(package, package)}")
+    return install_line(package)
 
 
 def accelerator() -> str:

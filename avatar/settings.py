@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import types
 from dataclasses import fields, is_dataclass
@@ -10,7 +9,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, did_you_mean, sentences, unknown_name
 
 Settings = TypeVar("Settings")
 
@@ -42,12 +41,8 @@ def settings_from_dict(kind: type[Settings], values: dict[str, Any], name: str =
     hints = get_type_hints(kind)
     for key in values:
         if key not in hints:
-            near = difflib.get_close_matches(str(key), hints, n=1)
-            raise AvatarError(
-                f"{name}{key}: no such option. "
-                + (f"Did you mean {near[0]!r}? " if near else "")
-                + f"There are: {', '.join(hints)}."
-            )
+            known = f"There are: {', '.join(hints)}."
+            raise AvatarError(sentences(f"{name}{key}: no such option.", did_you_mean(str(key), hints), known))
     converted = {key: convert_value(hints[key], value, f"{name}{key}") for key, value in values.items()}
     try:
         return kind(**converted)
@@ -82,7 +77,7 @@ def convert_value(hint: Any, value: Any, name: str) -> Any:
     if isinstance(hint, type) and issubclass(hint, Enum):
         if value in [member.value for member in hint]:
             return hint(value)
-        raise AvatarError(f"{name}: expected one of {', '.join(m.value for m in hint)}, got {value!r}.")
+        raise unknown_name(name, str(value), [str(member.value) for member in hint])
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if hint is Path and isinstance(value, str):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.checks import INSTALL_LINES, AvatarError, DataError, check_finite, check_shape, require
+from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
+from avatar.invocation import EXTRAS
 
 
 def test_check_shape_returns_named_sizes_for_arrays_and_tensors():
@@ -65,10 +66,10 @@ def test_data_error_names_the_file_and_the_mend_and_is_an_avatar_error():
 
 def test_require_gives_the_module_or_the_line_that_installs_it(monkeypatch):
     assert require("numpy") is np
-    with pytest.raises(AvatarError, match=r"no_such_thing is needed here .* Run: pip install no_such_thing"):
+    with pytest.raises(AvatarError, match=r"is needed here .* Run: \S*python -m pip install no_such_thing$"):
         require("no_such_thing")
-    monkeypatch.setitem(INSTALL_LINES, "no_such_thing", "pip install 'avatar[thing]'")
-    with pytest.raises(AvatarError, match=r"avatar\[thing\]"):
+    monkeypatch.setitem(EXTRAS, "no_such_thing", "thing")
+    with pytest.raises(AvatarError, match=r"-m pip install -e '\S+\[thing\]'$"):
         require("no_such_thing.part")
 
 

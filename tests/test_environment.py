@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from avatar.environment import inspect_package, mending_line
+from avatar.invocation import interpreter
 
 ROOT = Path(__file__).parents[1]
 
@@ -22,7 +23,7 @@ def test_a_missing_package_comes_with_its_install_line():
     finding = inspect_package("no_such_package_here", "nothing", needed=True)
     assert not finding.present
     assert "No module named" in finding.seen
-    assert finding.mend == "pip install no_such_package_here"
+    assert finding.mend.endswith("python -m pip install no_such_package_here")
 
 
 @pytest.mark.parametrize(
@@ -30,7 +31,7 @@ def test_a_missing_package_comes_with_its_install_line():
     [
         ("ImportError: libGL.so.1: cannot open shared object file", "apt-get install -y libgl1"),
         ("OSError: libusb-1.0.so.0: cannot open shared object file", "apt-get install -y libusb-1.0-0"),
-        ("ModuleNotFoundError: No module named 'open3d'", "pip install 'avatar[mesh]'"),
+        ("ModuleNotFoundError: No module named 'open3d'", f"{interpreter()} -m pip install -e '{ROOT}[mesh]'"),
     ],
 )
 def test_a_missing_library_is_mended_by_its_package(message, line):

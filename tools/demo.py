@@ -1,7 +1,6 @@
 """The main job on the embedded sample: python tools/demo.py"""
 
-from avatar.config import command
-from avatar.pipeline.demo import demo
+from start import run
 
 if __name__ == "__main__":
-    command("demo", demo)
+    run("demo")

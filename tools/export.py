@@ -1,7 +1,6 @@
 """Writes animation files of a predicted motion: python tools/export.py run=<run folder> predictions=walk"""
 
-from avatar.config import command
-from avatar.pipeline.surfaces import export
+from start import run
 
 if __name__ == "__main__":
-    command("export", export)
+    run("export")

@@ -1,7 +1,6 @@
 """Fits an unseen outfit from one scan: python tools/fit.py run=<run folder of several outfits> outfit=<new outfit>"""
 
-from avatar.config import command
-from avatar.training.fitting import fit_outfit
+from start import run
 
 if __name__ == "__main__":
-    command("fit", fit_outfit)
+    run("fit")

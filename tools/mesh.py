@@ -1,7 +1,6 @@
 """Meshes predictions: python tools/mesh.py run=<run folder>"""
 
-from avatar.config import command
-from avatar.pipeline.surfaces import mesh
+from start import run
 
 if __name__ == "__main__":
-    command("mesh", mesh)
+    run("mesh")

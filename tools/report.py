@@ -1,7 +1,6 @@
 """Writes a run's page: python tools/report.py run=<run folder>"""
 
-from avatar.config import command
-from avatar.pipeline.reporting import report
+from start import run
 
 if __name__ == "__main__":
-    command("report", report)
+    run("report")

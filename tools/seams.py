@@ -1,7 +1,6 @@
 """Measures predictions at the seams of the UV atlas: python tools/seams.py runs=[<run of pop>,<run of closet>]"""
 
-from avatar.config import command
-from avatar.pipeline.seams import seams
+from start import run
 
 if __name__ == "__main__":
-    command("seams", seams)
+    run("seams")

@@ -1,7 +1,6 @@
 """Makes the open dataset: python tools/simulate.py preset=quick"""
 
-from avatar.config import command
-from avatar.simulate.recording import simulate
+from start import run
 
 if __name__ == "__main__":
-    command("simulate", simulate)
+    run("simulate")

@@ -1,7 +1,6 @@
 """Kills, corrupts, poisons and races the program and counts what it lost: python tools/torture.py only=[kill,flips]"""
 
-from avatar.config import command
-from avatar.pipeline.torture.trials import torture
+from start import run
 
 if __name__ == "__main__":
-    command("torture", torture)
+    run("torture")

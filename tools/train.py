@@ -1,7 +1,6 @@
 """Trains an avatar: python tools/train.py outfit=dress method=closet size=small"""
 
-from avatar.config import command
-from avatar.pipeline.methods import train
+from start import run
 
 if __name__ == "__main__":
-    command("train", train)
+    run("train")

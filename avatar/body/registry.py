@@ -15,7 +15,7 @@ from avatar.body.model import BodyModel
 from avatar.body.open import open_body
 from avatar.body.packed import packed_body
 from avatar.body.smpl import DOWNLOAD_PAGES, smpl_body, way_to_file
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, unknown_name
 
 CANONICAL_POSES = {"t": 0.0, "apart": 25.0}  # degrees by which each hip is turned outwards
 
@@ -34,7 +34,7 @@ class BodyConfig:
 
     def __post_init__(self):
         if self.name not in BODIES:
-            raise AvatarError(f"body.name: expected one of {', '.join(BODIES)}, got {self.name!r}.")
+            raise unknown_name("body.name", self.name, BODIES)
         if self.canonical not in CANONICAL_POSES:
             known = ", ".join(CANONICAL_POSES)
             raise AvatarError(f"body.canonical: expected one of {known}, got {self.canonical!r}.")
@@ -62,7 +62,7 @@ def canonical_pose(name: str, joint_names: Sequence[str]) -> Tensor:
         AvatarError: for an unknown name, or a body without the joints it needs.
     """
     if name not in CANONICAL_POSES:
-        raise AvatarError(f"canonical pose: expected one of {', '.join(CANONICAL_POSES)}, got {name!r}.")
+        raise unknown_name("canonical pose", name, CANONICAL_POSES)
     pose = torch.zeros(len(joint_names), 3)
     if CANONICAL_POSES[name]:
         for joint, outwards in (("left_hip", 1), ("right_hip", -1)):

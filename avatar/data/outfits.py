@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from avatar.checks import SAFE_NAME, AvatarError, DataError, check_name
+from avatar.checks import SAFE_NAME, AvatarError, DataError, check_name, did_you_mean, sentences
 from avatar.data.soundness import check_frame, check_template
 from avatar.io.documents import read_yaml
 from avatar.io.ledger import digest_of, file_digest, files_digest
@@ -59,7 +59,8 @@ class Outfit(ABC):
             return self.held_back
         if split not in SPLITS:
             held = ", or validation where frames were held back from training" if split == VALIDATION else ""
-            raise AvatarError(f"split: expected train or test{held}, got {split!r}.")
+            near = did_you_mean(split, (*SPLITS, VALIDATION))
+            raise AvatarError(sentences(f"split: expected train or test{held}, got {split!r}.", near))
         return self._listed[split] or self._refuse_empty(split)
 
     def with_validation(self, names: Sequence[str]) -> Self:
@@ -179,13 +180,13 @@ def outfit_folder(root: Path, dataset: str, outfit: str) -> Path:
     if (parent / "packed").is_dir():
         parent = parent / "packed"
     if not parent.is_dir():
+        near = did_you_mean(dataset, ["sample", *(path.name for path in Path(root).glob("*/"))])
         mend = f"Make it with tools/simulate.py, or put the data there as {parent}/<outfit>/train/*.npz."
-        raise DataError(parent, f"expected the folder of data set {dataset}, there is none.", mend)
+        raise DataError(parent, f"expected the folder of data set {dataset}, there is none.", sentences(near, mend))
     there = outfit_names(parent)
     if outfit not in there:
-        near = difflib.get_close_matches(outfit, there, n=1)
-        hint = f"Did you mean {near[0]}? " if near else ""
-        raise DataError(parent / outfit, f"no such outfit. {hint}There are: {', '.join(there) or 'none'}.")
+        mend = sentences(did_you_mean(outfit, there), f"There are: {', '.join(there) or 'none'}.")
+        raise DataError(parent / outfit, "no such outfit.", mend)
     folder = parent / outfit
     if not folder.resolve().is_relative_to(parent.resolve()):
         raise DataError(folder, f"expected a folder inside {parent}, it is a link to {folder.resolve()}.")

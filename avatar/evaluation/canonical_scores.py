@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from avatar.checks import AvatarError, check_shape, require
+from avatar.checks import AvatarError, check_shape
 from avatar.evaluation.aggregate import method_key
 from avatar.evaluation.canonical_truth import (
     APART,
@@ -28,6 +28,7 @@ from avatar.evaluation.metrics import Metric
 from avatar.evaluation.scores import FrameScore, Score, Scores
 from avatar.evaluation.scoring import Label, Outfit, mean_scores
 from avatar.evaluation.tables import Table, TableRow
+from avatar.progress import tracked
 from avatar.records import Frame, Mesh, Template
 
 TRUE = "true weights"
@@ -223,7 +224,7 @@ def score_canonicalization(
     surfaces = canonical_surfaces(outfit, split, names[0])
     frames: list[FrameScore] = []
     counts: dict[Label, list[int]] = {label: [] for label in labels}
-    for name in require("tqdm").tqdm(names, desc=f"canonical scans of {outfit.name}", disable=None):
+    for name in tracked(names, f"score canonical scans of {outfit.name}"):
         frame = outfit.load(split, name)
         try:
             truth = frame_truth(frame.scan, template)

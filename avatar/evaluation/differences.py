@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar.checks import AvatarError
+from avatar.checks import unknown_name
 from avatar.evaluation.aggregate import Interval, base_method, bootstrap_difference, method_key, order_methods
 from avatar.evaluation.metrics import METRICS
 from avatar.evaluation.scores import Score, Scores
@@ -43,7 +43,7 @@ def compare_methods(
     frames = [row for row in scores.frames if row.metric == metric]
     methods = order_methods({method_key(row) for row in frames})
     if baseline not in {*methods, *map(base_method, methods)}:
-        raise AvatarError(f"baseline: expected one of {', '.join(methods)}, got {baseline!r}.")
+        raise unknown_name("baseline", baseline, methods)
     found = []
     for method in methods:
         other = find_baseline(method, methods, baseline)

@@ -12,13 +12,14 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from avatar.checks import AvatarError, DataError, require
+from avatar.checks import AvatarError, DataError
 from avatar.evaluation.comparison import Comparison
 from avatar.evaluation.metrics import METRICS, Metric, find_metrics
 from avatar.evaluation.scores import FrameScore, Score, Scores
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
+from avatar.progress import tracked
 from avatar.records import Frame, Mesh, PointCloud, Scan
 
 log = logging.getLogger(__name__)
@@ -244,9 +245,7 @@ def score_frames(
         log.warning("%s: no template, so penetration into the body is not scored.", outfit.name)
     frames: list[FrameScore] = []
     counts, window = [], []
-    for name in require("tqdm").tqdm(
-        sorted(names, key=_in_time), desc=f"{label.method} on {outfit.name}", disable=None
-    ):
+    for name in tracked(sorted(names, key=_in_time), f"score {label.method} on {outfit.name}"):
         known = memory.recall(name) if memory else None
         if known:
             values, points = known["values"], known["points"]

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from avatar.checks import AvatarError
+from avatar.checks import unknown_name
 from avatar.evaluation.aggregate import Interval, bootstrap_mean
 from avatar.evaluation.scoring import Label
 from avatar.evaluation.seams import BODY, LIMITS, UNITS, FrameMean, SeamKey
@@ -73,7 +73,7 @@ def seam_differences(tests: Sequence[SeamTest], baseline: str, confidence: float
     """
     names = [test.name for test in tests]
     if baseline not in names:
-        raise AvatarError(f"baseline: expected one of {', '.join(names)}, got {baseline!r}.")
+        raise unknown_name("baseline", baseline, names)
     base, others = tests[names.index(baseline)], [test for test in tests if test.name != baseline]
     body = []
     for metric in ("distance", "angle"):

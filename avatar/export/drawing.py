@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from avatar.checks import INSTALL_LINES, AvatarError, check_finite, require
+from avatar.checks import AvatarError, check_finite, require, unknown_name
 from avatar.geometry.trees import build_tree
+from avatar.invocation import install_line
 
 AZIMUTHS = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0, "side": 90.0, "three_quarter": 35.0}
 BACKGROUND = (0.957, 0.957, 0.945)
@@ -89,7 +90,7 @@ def frame_camera(
 
 def _azimuth(view: str) -> float:
     if view not in AZIMUTHS:
-        raise AvatarError(f"view: expected one of {', '.join(AZIMUTHS)}, got {view!r}.")
+        raise unknown_name("view", view, AZIMUTHS)
     return AZIMUTHS[view]
 
 
@@ -157,7 +158,7 @@ def load_pyvista() -> ModuleType:
         if not any(_loads(name) for name in GL_LIBRARIES):
             raise AvatarError(
                 f"pictures need one of {', '.join(GL_LIBRARIES)}, and this machine has none. "
-                f"Run: {INSTALL_LINES['pyvista']}"
+                f"Run: {install_line('pyvista')}"
             )
         if "DISPLAY" not in os.environ:
             os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")

@@ -15,12 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import INSTALL_LINES, AvatarError, DataError, check_finite, check_shape, require
+from avatar.checks import AvatarError, DataError, check_finite, check_shape
 from avatar.export.poisson import FAILED, READY, SOLVED, serve
 from avatar.export.trimming import trim_surface
+from avatar.invocation import install_line
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import FORMATS, check_mesh, write_mesh
 from avatar.io.points import read_points
+from avatar.processes import interrupts_blocked
+from avatar.progress import tracked
 from avatar.records import Mesh, PointCloud
 
 MIN_POINTS = 100
@@ -155,7 +158,8 @@ class PoissonMesher:
         self._connection, far_end = context.Pipe()
         memory = int(self.config.memory_gb * 2**30)
         self._process = context.Process(target=serve, args=(far_end, memory), name="poisson", daemon=True)
-        self._process.start()
+        with interrupts_blocked():
+            self._process.start()
         far_end.close()
         try:
             if not self._connection.poll(START_TIMEOUT_S):
@@ -166,11 +170,11 @@ class PoissonMesher:
             self.close()
             raise AvatarError(
                 "the meshing process died while importing open3d. A script that meshes needs "
-                f"'if __name__ == \"__main__\":'; otherwise run: {INSTALL_LINES['open3d']}"
+                f"'if __name__ == \"__main__\":'; otherwise run: {install_line('open3d')}"
             ) from error
         if reason:
             self.close()
-            raise AvatarError(f"open3d cannot be imported ({reason}). Run: {INSTALL_LINES['open3d']}")
+            raise AvatarError(f"open3d cannot be imported ({reason}). Run: {install_line('open3d')}")
 
 
 def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -252,7 +256,7 @@ def mesh_folder(
     done, skipped, failed, ledger = [], [], {}, Ledger(meshes_dir)
     settings = config or PoissonConfig()
     with PoissonMesher(config) as mesher:
-        for name in require("tqdm").tqdm(names, desc="meshing", unit="frame"):
+        for name in tracked(names, "mesh"):
             source = predictions_dir / f"{name}.ply"
             targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
             made = [getattr(settings, option) for option in ("depth", "max_hole", "min_part")]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.checks import DataError
+from avatar.progress import WORK
 
 LEDGER = ".finished.jsonl"
 
@@ -43,6 +44,7 @@ class Ledger:
             path = self.path.parent / file
             if not path.is_file() or file_digest(path) != digest:
                 return None
+        WORK["found"] += 1
         return True if entry["note"] is None else entry["note"]
 
     def record(self, name: str, key: str, files: Iterable[Path] = (), note: Any = None) -> None:
@@ -63,6 +65,7 @@ class Ledger:
             mend = "Make room and give the same command again."
             raise DataError(self.path, f"could not be written ({error.strerror}).", mend) from error
         self.torn, self.entries[name] = False, entry
+        WORK["made"] += 1
 
 
 def _unseal(line: bytes) -> dict[str, Any] | None:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, unknown_name
 from avatar.geometry.surface import sample_surface
 from avatar.nn.baselines.pop import PopAvatar, PopConfig
 from avatar.nn.baselines.scale import ScaleAvatar, ScaleConfig
@@ -38,7 +38,7 @@ def find_method(name: str) -> Method:
         AvatarError: listing the methods there are.
     """
     if name not in METHODS:
-        raise AvatarError(f"method: expected one of {', '.join(METHODS)}, got {name!r}.")
+        raise unknown_name("method", name, METHODS)
     return METHODS[name]
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from avatar.canonical.rivals import SkinningSource
 from avatar.canonical.scans import canonicalize_scan
@@ -25,6 +24,7 @@ from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.npz import write_whole
 from avatar.pipeline.scores import current_commit
 from avatar.pipeline.surfaces import spaced_frames
+from avatar.progress import tracked
 from avatar.records import Frame, Mesh, PointCloud
 from avatar.training.canonicalizing import (
     CanonicalizeConfig,
@@ -104,7 +104,7 @@ def draw_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> li
         chosen = spaced_frames([name for of, name in places if of == split], config.pictures)
         if not chosen:
             continue
-        rows = [draw_frame(config, frames, places[split, name]) for name in tqdm(chosen, desc="pictures", disable=None)]
+        rows = [draw_frame(config, frames, places[split, name]) for name in tracked(chosen, "pictures", unit="picture")]
         written.append(config.folder / "pictures" / f"{split}.png")
         save_picture(written[-1], contact_sheet(rows, chosen, COLUMNS))
     return written

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,8 @@ from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, pred
 from avatar.pipeline.surfaces import MeshConfig, mesh
 from avatar.training.canonicalizing import CanonicalizeConfig
 from avatar.training.runs import MethodChoice, RunConfig, train_run
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -36,7 +39,7 @@ def demo(config: DemoConfig) -> Path:
 
     @contextmanager
     def stage(name: str) -> Iterator[None]:
-        print(f"demo: {name}", flush=True)
+        log.info("demo: %s", name)
         started = time.monotonic()
         yield
         seconds[name] = round(time.monotonic() - started, 1)
@@ -78,8 +81,4 @@ def demo(config: DemoConfig) -> Path:
     }
     path = config.runs_root / "demo" / "summary.json"
     write_whole(path, json.dumps(summary, indent=1).encode())
-    print(f"\ndemo: done in {summary['seconds']['total']:.0f} s")
-    for what, paths in summary["made"].items():
-        print(f"  {what:15} {paths if isinstance(paths, str) else ', '.join(paths)}")
-    print(f"  summary         {path}")
     return path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from avatar.checks import AvatarError
+from avatar.checks import unknown_name
 from avatar.implicit.avatar import ImplicitAvatar
 from avatar.io.documents import read_yaml
 from avatar.nn.methods import METHODS
@@ -21,7 +21,7 @@ def find_settings(name: str) -> type:
         AvatarError: listing the methods there are.
     """
     if name not in SETTINGS:
-        raise AvatarError(f"method: expected one of {', '.join(SETTINGS)}, got {name!r}.")
+        raise unknown_name("method", name, SETTINGS)
     return SETTINGS[name]
 
 

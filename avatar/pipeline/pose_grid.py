@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from tqdm import tqdm
 
 from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
@@ -19,6 +18,7 @@ from avatar.export.pictures import contact_sheet, frame_camera, render_points, s
 from avatar.io.points import read_points
 from avatar.pipeline.scores import predictions_folder
 from avatar.pipeline.surfaces import spaced_frames
+from avatar.progress import tracked
 from avatar.records import PointCloud
 from avatar.settings import settings_from_dict
 
@@ -63,7 +63,7 @@ def draw_pose_grid(path: Path, runs: Sequence[Path], count: int, split: str, dat
     for name in dict.fromkeys(one.outfit for one in found):
         mine = {one.method: one.folder for one in found if one.outfit == name}
         outfit = next(one for one in found if one.outfit == name).load_outfit()
-        for frame in tqdm(spaced_frames(list(outfit.frames(split)), count), desc=f"pictures of {name}", disable=None):
+        for frame in tracked(spaced_frames(list(outfit.frames(split)), count), f"pictures of {name}", unit="picture"):
             rows.append(draw_pose(outfit, split, frame, [mine.get(method) for method in methods]))
             labels.append(f"{name}: {frame}" if len({one.outfit for one in found}) > 1 else frame)
     save_picture(path, contact_sheet(rows, labels, [*methods, TRUTH]))

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from tqdm import tqdm
-
 from avatar.checks import AvatarError, check_name
 from avatar.data.outfits import Outfit
 from avatar.evaluation.scoring import Label
@@ -17,6 +15,7 @@ from avatar.io.npz import write_whole
 from avatar.pipeline.methods import is_implicit, load_avatar
 from avatar.pipeline.scores import current_commit, run_outfits, variant_of
 from avatar.pipeline.surfaces import spaced_frames
+from avatar.progress import tracked
 from avatar.training.prediction import body_batch, outfit_index, predict
 from avatar.training.runs import TrainedAvatar
 
@@ -74,7 +73,7 @@ def probe_seams(config: SeamsConfig, avatar: TrainedAvatar, outfit: Outfit) -> S
     places = seam_places(outfit.template, config.points, config.seed)
     names = spaced_frames(list(outfit.frames(config.split)), config.frames)
     frames = []
-    for name in tqdm(names, desc=f"seams of {settings.method.variant} on {outfit.name}", disable=None):
+    for name in tracked(names, f"seams of {settings.method.variant} on {outfit.name}"):
         frame = outfit.load(config.split, name)
         cloud = predict(avatar.model, body_batch([frame.body], index, (name,)), places.samples)
         frames.append(measure_seams(cloud, frame.scan, places))

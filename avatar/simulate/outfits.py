@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, unknown_name
 
 
 @dataclass
@@ -128,5 +128,5 @@ def outfit(name: str, shape: str | None = None) -> OutfitConfig:
         AvatarError: for an unknown name, listing those there are.
     """
     if name not in GARMENTS:
-        raise AvatarError(f"outfit: expected one of {', '.join(GARMENTS)}, got {name!r}.")
+        raise unknown_name("outfit", name, GARMENTS)
     return OutfitConfig(name, shape or DEFAULT_SHAPES[name], GARMENTS[name]())

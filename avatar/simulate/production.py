@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import torch
 import yaml
-from tqdm import tqdm
 
 from avatar import __version__
 from avatar.body.model import BodyModel
@@ -22,6 +19,8 @@ from avatar.body.packed import packed_body, write_body
 from avatar.checks import DataError
 from avatar.io.frames import OpenGarment, read_open_frame, read_open_garment, write_manifest, write_open_garment
 from avatar.io.ledger import Ledger, digest_of, file_digest
+from avatar.processes import in_workers
+from avatar.progress import tracked
 from avatar.records import Motion
 from avatar.simulate.dressing import DressedBody, TravelConfig
 from avatar.simulate.gates import FrameReport, GateConfig, frame_names, record_frame, record_motion
@@ -186,19 +185,16 @@ def simulate_outfit(
         jobs = [(pose, folder / split / f"{pose.name}.npz") for split, named in poses.items() for pose in named]
         done = FrameLedger(folder, len(dressed.labels))
         jobs = [(pose, path) for pose, path in jobs if not done.has(path, pose.pose)]
-        bar = {"total": len(jobs), "desc": f"{outfit.name} on {outfit.shape}", "unit": "frame", "disable": not progress}
+        bar = {"total": len(jobs), "what": f"simulate {outfit.name} on {outfit.shape}", "silent": not progress}
         if workers == 1 or len(jobs) < 2:
-            reports = []
-            for pose, path in tqdm(jobs, **bar):
-                reports.append(record_frame(dressed, pose, path, gates))
-                done.note(path, pose.pose)
+            made = ((job, record_frame(dressed, *job, gates)) for job in jobs)
         else:
-            with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (outfit, travel, gates)) as pool:
-                futures = {pool.submit(_record_in_worker, pose, path): (path, pose.pose) for pose, path in jobs}
-                reports = []
-                for future in tqdm(as_completed(futures), **bar):
-                    reports.append(future.result())
-                    done.note(*futures[future])
+            made = in_workers(_record_in_worker, jobs, workers, _start_worker, (outfit, travel, gates))
+        reports = []
+        with closing(made):
+            for (pose, path), report in tracked(made, **bar):
+                reports.append(report)
+                done.note(path, pose.pose)
     write_manifest(folder)
     return reports
 
@@ -226,19 +222,16 @@ def simulate_motions(
         jobs = [(motion, folder / split) for split, named in motions.items() for motion in named]
         done = FrameLedger(folder, len(dressed.labels))
         jobs = [job for job in jobs if not all(done.has(*frame) for frame in frames_of(*job))]
-        bar = {"total": len(jobs), "desc": f"{outfit.name} on {outfit.shape}", "unit": "sequence"}
+        bar = {"total": len(jobs), "what": f"simulate {outfit.name} on {outfit.shape}", "unit": "sequence"}
         if workers == 1 or len(jobs) < 2:
-            reports = []
-            for job in tqdm(jobs, **bar):
-                reports.append(record_motion(dressed, *job, gates))
-                done.note_all(frames_of(*job))
+            made = ((job, record_motion(dressed, *job, gates)) for job in jobs)
         else:
-            with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (outfit, travel, gates)) as pool:
-                futures = {pool.submit(_play_in_worker, *job): job for job in jobs}
-                reports = []
-                for future in tqdm(as_completed(futures), **bar):
-                    reports.append(future.result())
-                    done.note_all(frames_of(*futures[future]))
+            made = in_workers(_play_in_worker, jobs, workers, _start_worker, (outfit, travel, gates))
+        reports = []
+        with closing(made):
+            for job, report in tracked(made, **bar):
+                reports.append(report)
+                done.note_all(frames_of(*job))
     write_manifest(folder)
     return [report for part in reports for report in part]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.body.open import open_body_shapes
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, unknown_name
 from avatar.io.motions import read_motion, resample_motion
 from avatar.records import Motion
 from avatar.simulate.dressing import TravelConfig
@@ -81,9 +81,9 @@ class SimulateConfig:
 
 def check_names(name: str, given: list[str], known: tuple[str, ...]) -> None:
     """Refuses names that are not known, listing those that are."""
-    unknown = [value for value in given if value not in known]
-    if unknown:
-        raise AvatarError(f"{name}: expected {', '.join(known)}, got {', '.join(map(repr, unknown))}.")
+    for value in given:
+        if value not in known:
+            raise unknown_name(name, value, known)
 
 
 def dressed_outfits(config: SimulateConfig) -> list[tuple[str, OutfitConfig]]:

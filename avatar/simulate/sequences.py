@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, unknown_name
 from avatar.records import Motion
 from avatar.simulate.angles import Angles, pose_from_angles
 
@@ -153,7 +153,7 @@ def authored_motion(name: str, fps: float = 30.0, seconds: float = 6.0) -> Motio
         AvatarError: for an unknown name, or when no frame would result.
     """
     if name not in SEQUENCES:
-        raise AvatarError(f"name: expected one of {', '.join(SEQUENCES)}, got {name!r}.")
+        raise unknown_name("name", name, SEQUENCES)
     frames = round(fps * seconds)
     if frames < 1:
         raise AvatarError(f"fps, seconds: expected at least one frame, got {fps} fps for {seconds} s.")

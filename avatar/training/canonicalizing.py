@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from avatar.body.packed import read_template, write_template
 from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
@@ -33,6 +32,7 @@ from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.ledger import Ledger, digest_of
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
+from avatar.progress import tracked
 from avatar.records import CanonicalScan, Frame, Mesh, PointCloud, Template
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.building import building
@@ -215,7 +215,7 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
     source, stamp = skinning_source(config, template), stamp_of(config)
     done = Ledger(config.folder / "scans")
     written = []
-    for index, where in enumerate(tqdm(frames.names, desc="canonicalize", unit="scan", disable=None)):
+    for index, where in enumerate(tracked(frames.names, "canonicalize", unit="scan")):
         path = config.folder / "scans" / where.split / f"{where.name}.npz"
         written.append(path)
         made_of = frames.outfits[where.outfit].digest(where.split, where.name)

@@ -11,12 +11,12 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from avatar.canonical.canonicalizer import Canonicalizer, Latent
 from avatar.canonical.losses import TERMS, CanonicalLossConfig, canonicalization_loss
 from avatar.canonical.posed import DrawConfig, PosedScan, ScanBatch, draw_batch
 from avatar.checks import AvatarError
+from avatar.progress import Progress
 from avatar.records import LossTerms, Template
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.training.locks import lock_folder
@@ -100,18 +100,19 @@ class CycleTrainer:
     def run(self, log: TrainingLog, stop: StopRequest) -> None:
         """The steps from here to the end, with what is logged and saved between them."""
         started, config = time.monotonic() - self.seconds, self.config
-        with tqdm(total=config.steps, initial=self.step, desc="canonicalizer", unit="step", disable=None) as bar:
+        with Progress("canonicalizer", config.steps, "step", self.step, spent=self.seconds) as bar:
             while self.step < config.steps:
                 terms, norm = self.train_step()
                 self.step, self.seconds = self.step + 1, time.monotonic() - started
-                bar.update()
+                bar.advance()
                 done, stopping = self.step == config.steps, stop.number is not None
                 if self.step % config.log_every == 0 or done:
                     values = {name: float(value.detach()) for name, value in terms.raw.items()}
                     values |= {"loss": float(terms.total.detach()), "grad_norm": norm}
                     values["lr"] = self.optimiser.param_groups[0]["lr"]
                     log.write("train", self.step, self.epoch(), self.seconds, values)
-                    bar.set_postfix(loss=f"{values['loss']:.3f}", cycle=f"{1e3 * values.get('cycle_points', 0):.1f}mm")
+                    cycle = f"{1e3 * values.get('cycle_points', 0):.1f}mm"
+                    bar.show(loss=f"{values['loss']:.3f}", cycle=cycle)
                 if (self.step % config.save_every == 0 and not self.bad_steps) or done or stopping:
                     save_checkpoint(self.folder / "checkpoints", self.state(), self.step)
                 if stopping and not done:

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from tqdm import tqdm
 
 from avatar.body.packed import write_template
 from avatar.checks import AvatarError, check_name
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
 from avatar.nn.methods import draw_samples
+from avatar.progress import tracked
 from avatar.records import Batch
 from avatar.settings import settings_to_dict
 from avatar.training.checkpoints import write_weights
@@ -90,7 +90,7 @@ def fit_code(avatar: TrainedAvatar, batch: Batch, config: FitConfig) -> torch.Te
     vertices, faces = avatar.template.vertices, avatar.template.faces
     generator = torch.Generator().manual_seed(config.seed)
     samples = draw_samples(model, vertices, faces, config.points, generator).to(device)
-    for step in tqdm(range(config.steps), desc="fit", disable=None):
+    for step in tracked(range(config.steps), "fit", unit="step"):
         terms = point_avatar_loss(model(batch, samples), batch, config.loss, step / config.steps)
         optimiser.zero_grad()
         terms.total.backward()

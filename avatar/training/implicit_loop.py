@@ -11,12 +11,12 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar
 from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
 from avatar.implicit.probing import ProbeConfig, probe_field, space_points
+from avatar.progress import Progress
 from avatar.records import LossTerms
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.training.implicit_batches import CanonicalBatch, CanonicalFrames
@@ -83,16 +83,17 @@ class ImplicitTrainer:
             self.resume()
             log = TrainingLog(self.folder, ["loss", *TERMS, "lr", "grad_norm"], self.step)
             started = time.monotonic() - self.seconds
-            bar = tqdm(total=self.config.steps, initial=self.step, desc="train", unit="step", disable=None)
+            budget = 60 * self.config.minutes if self.config.minutes else None
+            bar = Progress("train", self.config.steps, "step", self.step, budget, self.seconds)
             while self.progress() < 1 and stop.number is None:
                 terms, norm = self.train_step(frames.batch_at(self.step, self.config.batch))
                 self.step, self.seconds = self.step + 1, time.monotonic() - started
-                bar.update()
+                bar.advance()
                 epoch = self.step * self.config.batch // len(frames)
                 if self.due(self.config.log_every):
                     values = log_values(terms) | {"lr": self.optimiser.param_groups[0]["lr"], "grad_norm": norm}
                     log.write("train", self.step, epoch, self.seconds, values)
-                    bar.set_postfix(loss=f"{values['loss']:.3f}", surface=f"{values['surface'] * 1e3:.1f}mm")
+                    bar.show(loss=f"{values['loss']:.3f}", surface=f"{values['surface'] * 1e3:.1f}mm")
                 score = None
                 if held_back and self.due(self.config.validate_every):
                     values = self.validate(held_back.ordered())

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from avatar.checks import AvatarError, check_shape
 from avatar.data.open_layout import OpenOutfit
@@ -17,6 +16,7 @@ from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.ledger import Ledger, keyed
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
+from avatar.progress import tracked
 from avatar.records import BodyFit, Motion
 from avatar.settings import settings_to_dict
 from avatar.training.prediction import MAX_POINTS, avatar_digest, pose_digest
@@ -71,7 +71,7 @@ def predict_implicit_frames(
     check_outfit(avatar, outfit)
     names = [name for name in outfit.frames(split) if keep(name)]
     written, done, made_by = [], Ledger(clouds), avatar_digest(avatar)
-    for name in tqdm(names, f"predict {outfit.name}", disable=None):
+    for name in tracked(names, f"predict {outfit.name}"):
         written.append(clouds / f"{name}.ply")
         made = {"points": points, "surface": settings_to_dict(config), "body": outfit.digest(split, name)}
         key = keyed(avatar=made_by, **made)
@@ -94,7 +94,7 @@ def predict_implicit_motion(
     check_outfit(avatar, outfit)
     check_shape("poses", motion.poses, "T J 3", J=len(avatar.template.parents))
     written, done, made_by = [], Ledger(clouds), avatar_digest(avatar)
-    for frame in tqdm(range(len(motion.poses)), desc=f"predict {motion.name}", disable=None):
+    for frame in tracked(range(len(motion.poses)), f"predict {motion.name}"):
         name = f"{motion.name}.{frame:05d}"
         written.append(clouds / f"{name}.ply")
         made = {"points": points, "surface": settings_to_dict(config), "body": pose_digest(outfit, motion, frame)}

@@ -15,10 +15,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from avatar.checks import AvatarError
 from avatar.nn.methods import draw_samples
+from avatar.progress import Progress
 from avatar.records import Batch, LossTerms, SurfaceSamples
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.training.distributed import (
@@ -148,18 +148,18 @@ class Trainer:
     ) -> None:
         """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
         started, config = time.monotonic() - self.seconds, self.config
-        off = None if log else True  # None: only where somebody watches
-        with tqdm(total=config.steps, initial=self.step, desc="train", unit="step", disable=off) as bar:
+        budget = 60 * config.minutes if config.minutes else None
+        with Progress("train", config.steps, "step", self.step, budget, self.seconds, silent=log is None) as bar:
             while self.progress() < 1:
                 terms, rate, norm = self.train_step(batch_at(self.step))
                 self.step += 1
                 stopping = self.tell_time(time.monotonic() - started, stop)
-                bar.update()
+                bar.advance()
                 done = self.progress() >= 1
                 epoch, score = self.step // epoch_length, None
                 if self.step % config.log_every == 0 or done:
                     values = self.team_mean(log_values(terms)) | {"lr": rate, "grad_norm": float(norm)}
-                    bar.set_postfix(loss=f"{values['loss']:.3f}", chamfer=f"{values['chamfer'] * 1e4:.3f}e-4")
+                    bar.show(loss=f"{values['loss']:.3f}", chamfer=f"{values['chamfer'] * 1e4:.3f}e-4")
                     if log:
                         log.write("train", self.step, epoch, self.seconds, values)
                 if self.step % config.validate_every == 0 or done:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from avatar.checks import AvatarError, check_shape
 from avatar.data.open_layout import OpenOutfit
@@ -17,6 +16,7 @@ from avatar.geometry.chunks import UNIT, in_chunks
 from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.io.points import write_points
 from avatar.nn.methods import draw_samples
+from avatar.progress import tracked
 from avatar.records import Batch, BodyFit, Motion, PointCloud, Prediction, SurfaceSamples
 from avatar.settings import settings_to_dict
 from avatar.training.runs import TrainedAvatar
@@ -101,7 +101,7 @@ def predict_frames(
     index = outfit_index(avatar, outfit.name)
     samples = template_samples(avatar, points)
     written, done, made_by = [], Ledger(folder), avatar_digest(avatar)
-    for name in tqdm([n for n in outfit.frames(split) if keep(n)], desc=f"predict {outfit.name}", disable=None):
+    for name in tracked([n for n in outfit.frames(split) if keep(n)], f"predict {outfit.name}"):
         written.append(folder / f"{name}.ply")
         key = keyed(avatar=made_by, points=points, body=outfit.digest(split, name))
         if not done.find(name, key):
@@ -141,7 +141,7 @@ def predict_motion(avatar: TrainedAvatar, outfit: OpenOutfit, motion: Motion, fo
     samples = template_samples(avatar, points)
     check_shape("poses", motion.poses, "T J 3", J=len(outfit.body.parents))
     written, done, made_by = [], Ledger(folder), avatar_digest(avatar)
-    for frame in tqdm(range(len(motion.poses)), desc=f"predict {motion.name}", disable=None):
+    for frame in tracked(range(len(motion.poses)), f"predict {motion.name}"):
         name = f"{motion.name}.{frame:05d}"
         written.append(folder / f"{name}.ply")
         key = keyed(avatar=made_by, points=points, body=pose_digest(outfit, motion, frame))

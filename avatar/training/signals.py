@@ -1,4 +1,4 @@
-"""Being asked to stop: SIGTERM and SIGUSR1 are noted, and the work ends where its state can be saved."""
+"""Being asked to stop: SIGINT, SIGTERM and SIGUSR1 are noted, and the work ends where its state can be saved."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-STOPPED = os.EX_TEMPFAIL  # exit code 75: nothing is wrong, the same command goes on
-SIGNALS = (signal.SIGTERM, signal.SIGUSR1)
+from avatar.invocation import STOPPED
+
+SIGNALS = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)
+DOUBLE_S = 0.1  # within which the same Ctrl-C may come twice: from the terminal and from a wrapper such as `timeout`
 
 
 class Stopped(Exception):
@@ -35,13 +38,26 @@ def listening(listener: Callable[[int, FrameType | None], Any], numbers: Iterabl
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
+def answer_interrupt(number: int, answer: str) -> None:
+    """After a Ctrl-C, answers it on the terminal and has the next one end the process at once."""
+    if number == signal.SIGINT:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        os.write(2, f"\n{answer} Ctrl-C again leaves at once.\n".encode())  # print might be what was interrupted
+        time.sleep(DOUBLE_S)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @contextmanager
 def leave_when_asked(passed_on: Callable[[int], bool] = lambda number: False) -> Iterator[None]:
-    """Leaves with exit code 75 when asked to stop, but when ``passed_on`` says that others do in this one's place."""
+    """Leaves with exit code 75 when asked to stop, but when ``passed_on`` says that others do in this one's place.
+
+    Others get SIGTERM for a Ctrl-C, which their terminal may have sent them already: a second would end them at once.
+    """
 
     def leave(number: int, frame: FrameType | None) -> None:
-        if not passed_on(number):
+        if not passed_on(signal.SIGTERM if number == signal.SIGINT else number):
             sys.exit(STOPPED)
+        answer_interrupt(number, "Stopping: the jobs save their state.")
 
     with listening(leave, SIGNALS):
         yield
@@ -58,8 +74,12 @@ class StopRequest:
         self.earlier: dict[int, Any] = {}
 
     def note(self, number: int, frame: FrameType | None) -> None:
-        """Keeps the first signal; those that follow change nothing, so that a save is never cut short."""
+        """Keeps the first signal; those that follow change nothing, so that a save is never cut short.
+
+        A second Ctrl-C alone ends the process; what was saved before stays whole.
+        """
         self.number = self.number or number
+        answer_interrupt(number, "Stopping: this step is finished and saved.")
 
     def leave(self, folder: Path) -> None:
         """Ends the work once its state is saved; who listened to SIGUSR2 before hears it now.

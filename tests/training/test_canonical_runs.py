@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
 from tiny import SETTINGS, canonical_truth, quick_training
 
 from avatar.body.packed import write_template
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
 from avatar.checks import AvatarError, DataError
-from avatar.config import CONF, VERBS, register, to_settings
+from avatar.config import compose_settings
 from avatar.data.splits import SplitConfig
 from avatar.geometry.surface import interpolate, sample_surface
 from avatar.geometry.transforms import transform_points
@@ -198,7 +197,6 @@ def test_a_canonicalizer_that_is_missing_or_anothers_is_refused(settings, tiny_o
 
 @pytest.mark.parametrize("verb", ["train", "demo"])
 def test_ready_made_variants_differ_from_closet_in_their_switch_alone(verb):
-    register()
     plain, learned, canonical, local = (
         compose_run(verb, name) for name in ("closet", "closet_learned", "closet_canonical", "closet_local")
     )
@@ -210,5 +208,4 @@ def test_ready_made_variants_differ_from_closet_in_their_switch_alone(verb):
 
 
 def compose_run(verb: str, method: str) -> RunConfig:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return to_settings(VERBS[verb], compose(verb, [f"method={method}"]))
+    return compose_settings(verb, f"method={method}")

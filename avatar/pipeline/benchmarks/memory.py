@@ -6,14 +6,13 @@ import ctypes
 import gc
 import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 import torch
 
 from avatar.environment import keep_freed_memory
 from avatar.pipeline.benchmarks.races import Job, Race
+from avatar.processes import in_workers
 
 STATUS = Path("/proc/self/status")
 
@@ -32,8 +31,8 @@ def peak_memory(build: Callable[[Job], list[Race]], job: Job, race: int, contend
     if not STATUS.is_file():
         return None
     threads = torch.get_num_threads()
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(_measure, build, job, race, contender, threads).result()
+    ((_, peak),) = in_workers(_measure, [(build, job, race, contender, threads)], workers=1)
+    return peak
 
 
 def _measure(build: Callable[[Job], list[Race]], job: Job, race: int, contender: str, threads: int) -> float:

@@ -11,8 +11,14 @@ from typing import Any
 import torch
 
 from avatar.checks import AvatarError
+from avatar.invocation import EXTRAS
 
 Run = Callable[[], Any]
+
+
+def absence(package: str) -> str:
+    """Why a contender is not there, for a table that others read: no path of this machine."""
+    return f"not installed (extra {EXTRAS[package]})"
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,12 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avatar.checks import INSTALL_LINES
 from avatar.export.rival_search import open3d_nearest
 from avatar.geometry.distances import correspond, gather_points, normal_difference, point_to_point
 from avatar.geometry.neighbours import nearest
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.pipeline.benchmarks.avatars import sample_outfit
-from avatar.pipeline.benchmarks.races import Job, Race
+from avatar.pipeline.benchmarks.races import Job, Race, absence
 
 Search = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -56,7 +55,7 @@ def rivals(names: tuple[str, ...]) -> tuple[dict[str, Search], dict[str, str]]:
     known = {"brute force": brute_nearest, "scipy": scipy_nearest, "open3d": open3d_nearest}
     missing = {"open3d"} if find_spec("open3d") is None else set()
     there = {name: known[name] for name in names if name not in missing}
-    return there, {name: f"not installed: {INSTALL_LINES[name]}" for name in names if name in missing}
+    return there, {name: absence(name) for name in names if name in missing}
 
 
 def nearest_races(job: Job) -> list[Race]:

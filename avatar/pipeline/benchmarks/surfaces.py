@@ -12,12 +12,11 @@ from torch import Tensor
 
 from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig
 from avatar.canonical.posed import prepare_scan
-from avatar.checks import INSTALL_LINES
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
 from avatar.implicit.sdf import PosedSdf, SdfConfig
 from avatar.pipeline.benchmarks.avatars import sample_outfit
-from avatar.pipeline.benchmarks.races import Job, Race, Run
+from avatar.pipeline.benchmarks.races import Job, Race, Run, absence
 from avatar.records import Mesh, PointCloud
 from avatar.settings import settings_from_dict
 from avatar.simulate.dressing import TravelConfig
@@ -81,7 +80,7 @@ def poisson_races(job: Job) -> list[Race]:
     """Meshing a scan in the guarded worker, by octree depth; the worker's memory is not in the table."""
     points, depths = job.size(40_000, 3000), job.size(8, 6)
     if find_spec("open3d") is None:
-        return [Race("poisson", f"{points:,} points", {}, "", absent={"depth 8": INSTALL_LINES["open3d"]})]
+        return [Race("poisson", f"{points:,} points", {}, "", absent={"depth 8": absence("open3d")})]
 
     def prepare(depth: int) -> Run:
         garment = sample_outfit()
@@ -98,7 +97,7 @@ def poisson_races(job: Job) -> list[Race]:
 def simulation_races(job: Job) -> list[Race]:
     """A settled frame of the tee and of the dress, from the bind pose to rest."""
     if find_spec("newton") is None:
-        return [Race("simulation", "settled frame", {}, "", absent={"newton": INSTALL_LINES["newton"]})]
+        return [Race("simulation", "settled frame", {}, "", absent={"newton": absence("newton")})]
     travel = TravelConfig(stride=0.3, hold=3, least_hold=1) if job.quick else TravelConfig()
 
     def prepare(name: str) -> Run:

@@ -1,0 +1,96 @@
+"""Verbs with a few arguments of their own and no settings: `doctor`, `convert_body`, `make_body` and `parameters`."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+from avatar.cli import refuse
+
+
+def parser_of(verb: Callable[[], None]) -> argparse.ArgumentParser:
+    """A parser of a verb's arguments that describes it by its docstring."""
+    text = inspect.cleandoc(verb.__doc__ or "")
+    return argparse.ArgumentParser(verb.__name__, description=text, formatter_class=argparse.RawTextHelpFormatter)
+
+
+def doctor() -> None:
+    """Prints what is installed, what is missing and the command that installs it; exits with 1 if a needed part is."""
+    from avatar.environment import accelerator, inspect_machine
+
+    parser_of(doctor).parse_args()
+    findings = inspect_machine()
+    for finding in findings:
+        mark = "ok " if finding.present else ("MISSING" if finding.needed else "absent ")
+        print(f"{mark:8}{finding.name:42}{finding.seen}" + ("" if finding.present else f"\n{'':8}-> {finding.mend}"))
+    lacking = [finding.name for finding in findings if finding.needed and not finding.present]
+    if not lacking:
+        print(f"training would run on: {accelerator()}")
+    sys.exit(bool(lacking))
+
+
+def convert_body() -> None:
+    """Converts a downloaded SMPL, SMPL-H or SMPL-X file (.npz or .pkl) to a plain .npz, running nothing that is in it.
+
+    convert_body SMPLX_NEUTRAL.npz data/bodies/smplx_neutral.npz
+    convert_body SMPL_NEUTRAL.pkl data/bodies/smpl_neutral.npz --uv smpl_uv.obj
+    convert_body data/mine/coat/template.npz with_uv.npz --uv body.obj
+    """
+    parser = parser_of(convert_body)
+    parser.add_argument("source", type=Path, help="the downloaded model, .npz or .pkl")
+    parser.add_argument("target", type=Path, help="the .npz to write")
+    parser.add_argument("--uv", type=Path, help="an OBJ of the same mesh whose texture coordinates POP is to use")
+    paths = parser.parse_args()
+
+    from avatar.body.convert import convert_body_model
+    from avatar.checks import AvatarError
+
+    try:
+        kind = convert_body_model(paths.source, paths.target, paths.uv)
+    except AvatarError as error:
+        sys.exit(refuse("convert_body", error))
+    print(f"{paths.target}: {kind} body, {paths.target.stat().st_size / 1e6:.1f} MB")
+
+
+def make_body() -> None:
+    """Makes a body of any shape with anny, for simulate shapes=[...]; each parameter lies in [0, 1].
+
+    make_body data/bodies/tall.npz --height 0.9 --weight 0.7
+    """
+    from avatar.body.anny import Phenotype, anny_body
+    from avatar.body.packed import write_body
+    from avatar.checks import AvatarError
+
+    parser = parser_of(make_body)
+    parser.add_argument("target", type=Path, help="the .npz to write")
+    for parameter in fields(Phenotype):
+        parser.add_argument(f"--{parameter.name}", type=float, default=parameter.default)
+    options = vars(parser.parse_args())
+    target = options.pop("target")
+    try:
+        body = anny_body(Phenotype(**options))
+        write_body(target, body)
+    except AvatarError as error:
+        sys.exit(refuse("make_body", error))
+    height = float(body.template.vertices[:, 1].max() - body.template.vertices[:, 1].min())
+    print(f"{target}: {len(body.template.vertices):,} vertices, {height:.2f} m tall")
+
+
+def parameters() -> None:
+    """Counts every method's parameters at both sizes: writes docs/results/parameters.csv and .md."""
+    from avatar.body.open import open_body
+    from avatar.config import CONF, compose_settings
+    from avatar.pipeline.parameters import write_parameters
+
+    parser_of(parameters).parse_args()
+    methods = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
+    choices = {
+        (method, size): compose_settings("train", f"method={method}", f"size={size}").method
+        for size in ("full", "small")
+        for method in methods
+    }
+    print(write_parameters(Path("docs/results"), choices, open_body("female").template))

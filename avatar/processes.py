@@ -1,0 +1,72 @@
+"""Worker processes: a pool of them, which the terminal's Ctrl-C does not reach and which ends with who started it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from multiprocessing.connection import wait
+from typing import Any
+
+
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Processes started within the ``with`` block never see SIGINT, which a terminal sends to all of its group.
+
+    The mask of signals is inherited; in this process a SIGINT waits until the end of the block.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_with_parent() -> None:
+    """Has this worker process end as soon as the process that started it is gone, however it went."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def in_workers(
+    work: Callable[..., Any],
+    jobs: Iterable[tuple[Any, ...]],
+    workers: int,
+    prepare: Callable[..., None] | None = None,
+    arguments: tuple[Any, ...] = (),
+) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Jobs and their results, as they are finished in worker processes; left early, it ends the workers at once.
+
+    Args:
+        work: called with each job's arguments.
+        jobs: arguments of each call.
+        workers: how many processes.
+        prepare, arguments: called once in each worker.
+    """
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, _begin_work, (prepare, arguments)) as pool:
+        try:
+            with interrupts_blocked():
+                futures = {pool.submit(work, *job): job for job in jobs}
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def _begin_work(prepare: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
+    end_with_parent()
+    if prepare is not None:
+        prepare(*arguments)

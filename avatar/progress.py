@@ -1,0 +1,137 @@
+"""How far a loop is: a bar on a terminal, a line now and then elsewhere; and a count of what this process has done.
+
+Lines are logged, so that a caller from Python hears them if it listens.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from typing import Self, TypeVar
+
+from tqdm import tqdm
+
+Item = TypeVar("Item")
+LINE_S = 10.0  # seconds between lines of a loop that does not say when to print one
+WORK: Counter[str] = Counter()  # of this process: `step`s trained, pieces `made` and those `found` finished already
+report = logging.getLogger(__name__)
+
+
+class Progress:
+    """A loop of ``total`` pieces of work that a budget of seconds may end before; a context manager."""
+
+    def __init__(
+        self,
+        what: str,
+        total: int,
+        unit: str = "frame",
+        done: int = 0,
+        budget: float | None = None,
+        spent: float = 0.0,
+        silent: bool = False,
+    ):
+        """Begins a loop.
+
+        Args:
+            what: the loop, for the user.
+            total: pieces of work at most.
+            unit: of one piece.
+            done: pieces that were finished earlier.
+            budget: seconds of work after which it ends as well; None for no limit.
+            spent: seconds of it that were spent earlier.
+            silent: show nothing (processes beside the leading one).
+        """
+        self.what, self.total, self.unit, self.done, self.before = what, total, unit, done, done
+        self.budget, self.spent, self.silent = budget, spent, silent
+        self.started = self.told = time.monotonic()
+        self.values, self.told_at = "", -1
+        watched = not silent and sys.stderr.isatty()
+        self.bar = tqdm(total=total, initial=done, desc=what, unit=unit) if watched else None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the bar, or says how far it came."""
+        if self.bar is not None:
+            self.bar.close()
+        else:
+            self.say()
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since it began."""
+        return time.monotonic() - self.started
+
+    def seconds_left(self) -> float:
+        """Seconds until all is done or the budget is spent, whichever comes first; infinite while nothing is known."""
+        new = self.done - self.before
+        by_work = self.seconds / new * (self.total - self.done) if new else math.inf
+        by_clock = self.budget - self.spent - self.seconds if self.budget is not None else math.inf
+        return max(0.0, min(by_work, by_clock))
+
+    def advance(self) -> None:
+        """One more piece is done."""
+        self.done += 1
+        WORK["step"] += self.unit == "step"
+        if self.bar is not None:
+            left = self.seconds_left()
+            pace = (self.done - self.before) / max(self.seconds, 1e-9)
+            if self.budget is not None and math.isfinite(left):  # the end that the bar's own estimate leads to
+                self.bar.total = min(self.total, self.done + max(1, round(left * pace)))
+            self.bar.update()
+        elif time.monotonic() - self.told > LINE_S:
+            self.say()
+
+    def show(self, **values: str) -> None:
+        """Values beside the bar, or a line with them."""
+        self.values = "".join(f", {name} {value}" for name, value in values.items())
+        if self.bar is not None:
+            self.bar.set_postfix_str(self.values.removeprefix(", "))
+        else:
+            self.say()
+
+    def say(self) -> None:
+        """A line, unless it would say the same again."""
+        if self.silent or self.told_at == self.done:
+            return
+        self.told, self.told_at = time.monotonic(), self.done
+        left = self.seconds_left() if self.done < self.total else 0.0
+        ahead = f", {in_words(left)} left" if 0 < left < math.inf else ""
+        report.info(
+            "%s: %s %d of %d%s, %s%s", self.what, self.unit, self.done, self.total, self.values, self.clock, ahead
+        )
+
+    @property
+    def clock(self) -> str:
+        """The time since it began, in words."""
+        return in_words(self.spent + self.seconds)
+
+
+def tracked(
+    items: Iterable[Item], what: str, unit: str = "frame", total: int | None = None, silent: bool = False
+) -> Iterator[Item]:
+    """The items, each done when the next one is asked for, under a `Progress`; ``total`` where they have no length."""
+    with Progress(what, len(items) if total is None else total, unit, silent=silent) as progress:
+        for item in items:
+            yield item
+            progress.advance()
+
+
+def in_words(seconds: float) -> str:
+    """A time for people: ``35 s``, ``12 min 5 s``, ``3 h 20 min``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if minutes else f"{hours} h"
