@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from avatar.body.model import BodyModel, check_bind
-from avatar.body.skinning import check_parents
+from avatar.body.skinning import blend_transforms, check_parents
 from avatar.checks import AvatarError, DataError, check_shape
+from avatar.geometry.transforms import invert_affine, invert_rigid, transform_points
 from avatar.io.atlases import read_obj_atlas
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import Template
@@ -26,6 +28,7 @@ OPTIONAL_KEYS = {
     "canonical_from_bind": "float J 4 4",
     "uv": "float U 2",
     "uv_faces": "int F 3",
+    "pose_directions": "float V 3 P",
     **BIND_KEYS,
 }
 
@@ -63,14 +66,13 @@ def dense_weights(ids: np.ndarray, values: np.ndarray, joints: int) -> np.ndarra
     return weights
 
 
-def joint_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
-    """Joint positions ``(J, 3)`` estimated from the skinning weights alone.
+def border_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
+    """Where each joint's subtree meets the rest of the body, ``(J, 3)`` float64; NaN where it shares no vertex with it.
 
-    A joint sits where its subtree meets the rest of the body: vertices are averaged by ``s (1 - s)``, s being the
-    sum of their weights over the subtree. The root has no such border and sits amid its children.
+    Vertices are averaged by ``s (1 - s)``, s being the sum of their weights over the subtree.
 
     Raises:
-        AvatarError: for parents that are no tree, or naming the joint whose subtree shares no vertex with the rest.
+        AvatarError: for parents that are no tree, or weights of another shape.
     """
     check_parents(parents)
     check_shape("weights", weights, "V J", V=len(vertices), J=len(parents))
@@ -78,11 +80,22 @@ def joint_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[in
     for joint in range(len(parents) - 1, 0, -1):
         subtree[:, parents[joint]] += subtree[:, joint]
     border = subtree * np.clip(1 - subtree, 0, None)
-    totals = border.sum(axis=0)
-    alone = [joint for joint in range(1, len(parents)) if totals[joint] < 1e-6]
-    if alone:
+    totals = border.sum(axis=0)[:, None]
+    return np.where(totals < 1e-6, np.nan, border.T @ vertices / np.maximum(totals, 1e-12))
+
+
+def joint_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
+    """Joint positions ``(J, 3)`` estimated from the skinning weights alone: see `border_positions`.
+
+    The root has no such border and sits amid its children.
+
+    Raises:
+        AvatarError: for parents that are no tree, or naming the joint whose subtree shares no vertex with the rest.
+    """
+    joints = border_positions(vertices, weights, parents)
+    alone = np.flatnonzero(np.isnan(joints[1:, 0])) + 1
+    if len(alone):
         raise AvatarError(f"joints: joint {alone[0]} shares no vertex with its parent; store `joints (J, 3)` as well.")
-    joints = border.T @ vertices / np.maximum(totals, 1e-12)[:, None]
     children = [joint for joint, parent in enumerate(parents) if parent == 0]
     joints[0] = joints[children].mean(axis=0) if children else vertices.mean(axis=0)
     return joints.astype(vertices.dtype)
@@ -99,8 +112,7 @@ def read_template(path: Path) -> Template:
     try:
         template = _template(arrays, arrays["vertices"], arrays.get("joints"))
         if "canonical_from_bind" in arrays:
-            bound = torch.from_numpy(arrays["canonical_from_bind"].astype(np.float32))
-            template = replace(template, canonical_from_bind=bound)
+            template = replace(template, canonical_from_bind=_float32(arrays["canonical_from_bind"]))
         check_bind(template)
     except AvatarError as error:
         raise DataError(path, str(error)) from error
@@ -110,16 +122,12 @@ def read_template(path: Path) -> Template:
 def write_body(path: Path, body: BodyModel) -> None:
     """Writes a body as a ``template.npz`` that `packed_body` poses exactly as it was.
 
-    Beside the T-pose it keeps the pose in which the skinning weights were painted. `write_template` does not, and
-    plain skinning of its T-pose puts some of the open body's vertices a centimetre elsewhere.
-
-    Raises:
-        AvatarError: for a body with pose blendshapes, which this file has no place for.
+    Beside the T-pose it keeps the pose in which the skinning weights were painted, and pose blendshapes.
     """
-    if body.pose_directions is not None:
-        raise AvatarError("body: expected one without pose blendshapes; keep its own file beside the dataset instead.")
     at_rest = body.with_canonical_pose(torch.zeros_like(body.canonical_pose)).template
-    write_arrays(path, {**_template_arrays(at_rest), **{key: getattr(body, key).cpu().numpy() for key in BIND_KEYS}})
+    kept = {key: getattr(body, key) for key in (*BIND_KEYS, "pose_directions")}
+    arrays = {key: value.cpu().numpy() for key, value in kept.items() if value is not None}
+    write_arrays(path, _template_arrays(at_rest) | arrays)
 
 
 def packed_body(path: Path) -> BodyModel:
@@ -128,22 +136,27 @@ def packed_body(path: Path) -> BodyModel:
     The file holds ``vertices (V, 3)`` in the T-pose, ``faces (F, 3)``, ``parents (J,)``, ``joint_names (J,)``, the
     skinning weights as ``weights (V, J)`` or as ``weight_joints (V, K)`` and ``weight_values (V, K)``, and maybe
     ``joints (J, 3)``, which are estimated from the weights where they are missing. A body whose weights were painted
-    in another pose has ``bind_vertices``, ``bind_joints`` and ``zero_from_bind (J, 4, 4)`` as well. A UV atlas, which
-    POP and SCALE need, is ``uv (U, 2)`` in [0, 1] and ``uv_faces (F, 3)``.
+    in another pose has ``bind_vertices``, ``bind_joints`` and ``zero_from_bind (J, 4, 4)`` as well, or
+    ``canonical_from_bind (J, 4, 4)`` alone, from which they follow; ``pose_directions (V, 3, 9 (J - 1))`` are pose
+    blendshapes as `BodyModel` takes them. A UV atlas, which POP and SCALE need, is ``uv (U, 2)`` in [0, 1] and
+    ``uv_faces (F, 3)``.
 
     Raises:
         DataError: for a missing or damaged file, missing keys, or arrays that do not make a body.
     """
     arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
     bound = [key for key in BIND_KEYS if key in arrays]
+    directions = _float32(arrays.get("pose_directions"))
     try:
         if not bound:
-            return BodyModel(_template(arrays, arrays["vertices"], arrays.get("joints")))
+            at_rest = _template(arrays, arrays["vertices"], arrays.get("joints"))
+            zero_from_bind = _float32(arrays.get("canonical_from_bind"))
+            return BodyModel(_bind_of(at_rest, zero_from_bind), zero_from_bind, pose_directions=directions)
         if len(bound) < len(BIND_KEYS):
             raise AvatarError(f"bind pose: expected all of {', '.join(BIND_KEYS)} or none, got {', '.join(bound)}.")
         bind = _template(arrays, arrays["bind_vertices"], arrays["bind_joints"])
-        return BodyModel(bind, torch.from_numpy(arrays["zero_from_bind"].astype(np.float32)))
-    except AvatarError as error:
+        return BodyModel(bind, _float32(arrays["zero_from_bind"]), pose_directions=directions)
+    except (AvatarError, torch.linalg.LinAlgError) as error:  # transforms that cannot be inverted
         raise DataError(path, str(error)) from error
 
 
@@ -177,6 +190,19 @@ def atlas_arrays(uv: Path, faces: np.ndarray, vertices: int) -> dict[str, np.nda
     if atlas is None:
         raise DataError(uv, "it has no texture coordinates.", "Export it with UVs (lines that begin with vt).")
     return {"uv": atlas.uv, "uv_faces": atlas.uv_faces.astype(np.int32)}
+
+
+def _bind_of(at_rest: Template, zero_from_bind: Tensor | None) -> Template:
+    """The bind pose of a body whose T-pose is given, which is the T-pose itself where ``zero_from_bind`` is None."""
+    if zero_from_bind is None:
+        return at_rest
+    check_bind(at_rest)
+    vertex_bind_from_zero = invert_affine(blend_transforms(at_rest.weights, zero_from_bind[None])[0])
+    return replace(
+        at_rest,
+        vertices=transform_points(vertex_bind_from_zero, at_rest.vertices),
+        joints=transform_points(invert_rigid(zero_from_bind), at_rest.joints),
+    )
 
 
 def _template_arrays(template: Template) -> dict[str, np.ndarray]:
@@ -218,3 +244,8 @@ def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.nd
         joint_names=tuple(str(name) for name in arrays["joint_names"]),
         **{key: torch.from_numpy(arrays[key].astype(kind)) for key, kind in atlas.items()},
     )
+
+
+def _float32(array: np.ndarray | None) -> Tensor | None:
+    """A float32 tensor of an array, or None."""
+    return None if array is None else torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,9 +14,10 @@ from torch import Tensor
 from avatar.body.anny import Phenotype, anny_body
 from avatar.body.model import BodyModel
 from avatar.body.open import open_body
-from avatar.body.packed import packed_body
-from avatar.body.smpl import DOWNLOAD_PAGES, smpl_body, way_to_file
+from avatar.body.packed import holds_template, packed_body
+from avatar.body.smpl import DOWNLOAD_PAGES, converted_kind, smpl_body, way_to_file
 from avatar.checks import AvatarError, unknown_name
+from avatar.settings import settings_from_dict
 
 CANONICAL_POSES = {"t": 0.0, "apart": 25.0}  # degrees by which each hip is turned outwards
 
@@ -27,9 +29,9 @@ class BodyConfig:
     name: str = "open"  # open, anny, smpl, smplh, smplx or packed
     shape: str = "female"  # open: one of the asset's shapes, or mean
     phenotype: Phenotype = field(default_factory=Phenotype)  # anny: shape parameters, each in [0, 1]
-    path: str = ""  # smpl, smplh, smplx: file from tools/convert_body.py; packed: template.npz
+    path: str = ""  # smpl, smplh, smplx: file from tools/convert_body.py; packed: template.npz or tools/make_body.py's
     betas: list[float] = field(default_factory=list)  # smpl, smplh, smplx: shape, standard deviations
-    all_joints: bool = False  # smpl, smplh, smplx: keep hand and face joints instead of the 22 of the body
+    all_joints: bool = True  # smpl, smplh, smplx: all joints of the file; false: hands and face at rest, 22 joints
     canonical: str = "t"  # t, or apart (hips 25 degrees outwards, for skirts)
 
     def __post_init__(self):
@@ -38,6 +40,8 @@ class BodyConfig:
         if self.canonical not in CANONICAL_POSES:
             known = ", ".join(CANONICAL_POSES)
             raise AvatarError(f"body.canonical: expected one of {known}, got {self.canonical!r}.")
+        if self.betas and self.name not in DOWNLOAD_PAGES:
+            raise AvatarError(f"body.betas: expected none, as a body of kind {self.name} has no such shape.")
         if self.name == "packed" and not self.path:
             raise AvatarError("body.path: expected the template.npz of a dataset's outfit, got none.")
         if self.name in DOWNLOAD_PAGES and not self.path:
@@ -55,6 +59,23 @@ def load_body(config: BodyConfig) -> BodyModel:
     return body.with_canonical_pose(canonical_pose(config.canonical, body.joint_names))
 
 
+def body_of_file(path: Path, settings: dict[str, Any], name: str = "") -> BodyModel:
+    """The body in a file, whichever of this project's commands wrote it.
+
+    Args:
+        path: a converted SMPL, SMPL-H or SMPL-X model, or a ``template.npz`` (see `packed_body`).
+        settings: options of `BodyConfig` but ``name`` and ``path``; ``model``, if any, is what the file must hold.
+        name: where the settings stand, for messages.
+
+    Raises:
+        AvatarError: for an unknown option.
+        DataError: for a missing or damaged file or one of another kind, with the command that makes a good one.
+    """
+    given = dict(settings)
+    model = given.pop("model", None) or ("packed" if holds_template(path) else converted_kind(path))
+    return load_body(settings_from_dict(BodyConfig, {**given, "name": model, "path": str(path)}, name))
+
+
 def canonical_pose(name: str, joint_names: Sequence[str]) -> Tensor:
     """A canonical pose by name, ``(J, 3)`` axis-angle: ``t``, or ``apart`` with both hips turned outwards.
 
@@ -70,6 +91,14 @@ def canonical_pose(name: str, joint_names: Sequence[str]) -> Tensor:
                 raise AvatarError(f"canonical pose {name!r}: expected a joint {joint}, got {', '.join(joint_names)}.")
             pose[list(joint_names).index(joint), 2] = outwards * math.radians(CANONICAL_POSES[name])
     return pose
+
+
+def canonical_name(body: BodyModel) -> str:
+    """The name of a body's canonical pose. Raises `AvatarError` for a pose that has none."""
+    for name in CANONICAL_POSES:
+        if torch.allclose(canonical_pose(name, body.joint_names).to(body.canonical_pose), body.canonical_pose):
+            return name
+    raise AvatarError(f"canonical pose: expected one of {', '.join(CANONICAL_POSES)}, got another.")
 
 
 def _smpl(config: BodyConfig) -> BodyModel:

@@ -128,6 +128,19 @@ def way_to_file(kind: str, path: str = "<file.npz>") -> str:
     )
 
 
+def converted_kind(path: Path) -> str:
+    """The kind of model a converted file holds: smpl, smplh or smplx.
+
+    Raises:
+        DataError: for a missing or damaged file, or one that tools/convert_body.py has not written.
+    """
+    try:
+        return str(read_arrays(path, {"kind": "text 1"})["kind"][0])
+    except DataError as error:
+        mend = f"Convert your own SMPL, SMPL-H or SMPL-X file: python tools/convert_body.py <downloaded file> {path}"
+        raise DataError(path, str(error).removeprefix(f"{path}: "), mend) from error
+
+
 def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
     """The arrays of a converted model, or an error that says how to come by one."""
     mend = way_to_file(kind or "smplx", str(path))

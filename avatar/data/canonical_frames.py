@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from avatar.body.model import BodyModel
 from avatar.checks import DataError
 from avatar.data.outfits import Outfit
 from avatar.io.canonical_scans import read_canonical_scan
-from avatar.records import BodyFit, Frame, Scan, Template
+from avatar.records import Frame, Scan, Template
 
 
 class CanonicalOutfit(Outfit):
@@ -26,9 +27,15 @@ class CanonicalOutfit(Outfit):
         super().__init__(posed.path, posed.dataset)
         self.posed, self.scans = posed, Path(scans)
 
-    def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
-        """The wearer in any pose, see `Outfit.fit_pose`."""
-        return self.posed.fit_pose(pose, translation)
+    @property
+    def body(self) -> BodyModel | None:
+        """The wearer's body."""
+        return self.posed.body
+
+    @property
+    def mean_body(self) -> BodyModel | None:
+        """The body a pose encoder sees."""
+        return self.posed.mean_body
 
     def frame_path(self, split: str, name: str) -> Path:
         """The canonical scan of one of the outfit's frames. Raises `AvatarError` for a name that is not among them."""

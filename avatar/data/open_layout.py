@@ -21,7 +21,6 @@ from avatar.data.fusion import fuse_mesh
 from avatar.data.outfits import SurfaceOutfit, read_outfit_settings
 from avatar.data.patterns import paint
 from avatar.data.scanner import DressedSurface, ScanConfig, scan_mesh, scan_points
-from avatar.data.soundness import check_pose
 from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_garment
 from avatar.records import BodyFit, Frame, Scan, Template
 
@@ -133,25 +132,6 @@ class OpenOutfit(SurfaceOutfit):
                 problem = f"{key}: expected {shape} as body and garment.npz have it, got {getattr(stored, key).shape}."
                 raise DataError(path, problem, "Frame and garment are of different outfits.")
         return stored
-
-    @torch.no_grad()
-    def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
-        """The wearer in any pose; what a pose encoder sees of it is in mean shape, with the root at rest."""
-        check_pose(pose, len(self.body.parents))
-        translation = np.zeros(3, np.float32) if translation is None else np.asarray(translation, np.float32)
-        pose = np.asarray(pose, np.float32)
-        turned = torch.from_numpy(pose)[None]
-        posed = self.body(turned, torch.from_numpy(translation)[None])
-        rootless = turned.clone()
-        rootless[:, 0] = self.body.canonical_pose[0]
-        return BodyFit(
-            vertices=posed.vertices[0].numpy(),
-            vertex_transforms=posed.vertex_transforms[0].numpy(),
-            joint_transforms=posed.joint_transforms[0].numpy(),
-            pose_vertices=self.mean_body(rootless).vertices[0].numpy(),
-            translation=translation,
-            pose=pose,
-        )
 
     def _surface(self, stored: OpenFrame, body_vertices: np.ndarray) -> DressedSurface:
         """Body and cloth as one mesh."""

@@ -11,9 +11,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import torch
 
+from avatar.body.model import BodyModel
 from avatar.checks import SAFE_NAME, AvatarError, DataError, check_name, did_you_mean, sentences
-from avatar.data.soundness import check_frame, check_template
+from avatar.data.consistency import check_joints
+from avatar.data.soundness import check_frame, check_pose, check_template
 from avatar.io.documents import read_yaml
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Scan, Template
@@ -42,10 +45,11 @@ class Outfit(ABC):
         """The body at rest in its canonical pose, float32.
 
         Raises:
-            DataError: for a missing or damaged file, or a body that is not in metres.
+            DataError: for a missing or damaged file, or a body that is not in metres or not at its joints.
         """
         template = self._read_template()
         check_template(template, self.path)
+        check_joints(template, self.path)
         return template
 
     def frames(self, split: str) -> tuple[str, ...]:
@@ -62,6 +66,10 @@ class Outfit(ABC):
             near = did_you_mean(split, (*SPLITS, VALIDATION))
             raise AvatarError(sentences(f"split: expected train or test{held}, got {split!r}.", near))
         return self._listed[split] or self._refuse_empty(split)
+
+    def has_frames(self, split: str) -> bool:
+        """Whether there are frames of a split: data may come without a test folder, or with an empty one."""
+        return bool(self._listed[split])
 
     def with_validation(self, names: Sequence[str]) -> Self:
         """The same outfit with some of its training frames as a split of their own, ``validation``, as well.
@@ -104,13 +112,51 @@ class Outfit(ABC):
         """One hash over the files that the outfit's frames share."""
         return files_digest(self.path)
 
+    @property
     @abstractmethod
+    def body(self) -> BodyModel | None:
+        """The wearer's body, or None where the outfit has only a mesh of it, which cannot be posed."""
+
+    @property
+    def mean_body(self) -> BodyModel | None:
+        """The body a pose encoder sees in place of the wearer's: the mean shape where the data has it."""
+        return self.body
+
+    def posable_body(self) -> BodyModel:
+        """The wearer's body. Raises `DataError` where there is only a mesh."""
+        if self.body is None:
+            problem = "posing needs skinning weights and joints, and there is only template.obj."
+            mend = "Add your own SMPL-family body: python tools/convert_body.py <downloaded file> template.npz."
+            raise DataError(self.path, problem, mend)
+        return self.body
+
+    @torch.no_grad()
     def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
-        """The wearer in any pose: ``(J, 3)`` axis-angle, and a translation ``(3,)`` in metres.
+        """The wearer in any pose; what a pose encoder sees of it is in mean shape, with the root at rest.
+
+        Args:
+            pose: ``(J, 3)`` axis-angle, radians, relative to the parent and to the T-pose.
+            translation: ``(3,)`` metres; zero if None.
 
         Raises:
-            AvatarError: for a pose of other joints, or where the layout does not know the wearer's joints.
+            AvatarError: for a pose of other joints, or where the outfit has no body that can be posed.
         """
+        body = self.posable_body()
+        check_pose(pose, len(body.parents))
+        translation = np.zeros(3, np.float32) if translation is None else np.asarray(translation, np.float32)
+        pose = np.asarray(pose, np.float32)
+        turned = torch.from_numpy(pose)[None]
+        posed = body(turned, torch.from_numpy(translation)[None])
+        rootless = turned.clone()
+        rootless[:, 0] = body.canonical_pose[0]
+        return BodyFit(
+            vertices=posed.vertices[0].numpy(),
+            vertex_transforms=posed.vertex_transforms[0].numpy(),
+            joint_transforms=posed.joint_transforms[0].numpy(),
+            pose_vertices=self.mean_body(rootless).vertices[0].numpy(),
+            translation=translation,
+            pose=pose,
+        )
 
     @cached_property
     def _listed(self) -> dict[str, tuple[str, ...]]:

@@ -10,21 +10,27 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avatar.body.model import BodyModel
-from avatar.body.packed import packed_body, write_template
-from avatar.body.skinning import blend_transforms
+from avatar.body.model import SMPL_JOINTS, BodyModel
+from avatar.body.packed import write_body, write_template
+from avatar.body.registry import body_of_file, canonical_name
+from avatar.body.skinning import blend_transforms, skin_transforms
 from avatar.checks import AvatarError, DataError, check_shape, require
-from avatar.data.outfits import OUTFIT_FORMAT, SPLITS, Outfit
-from avatar.data.soundness import check_pose
+from avatar.data.consistency import check_carried, check_posed
+from avatar.data.outfits import OUTFIT_FORMAT, SPLITS, Outfit, read_outfit_settings
+from avatar.data.soundness import check_pose, check_size
 from avatar.geometry.transforms import invert_rigid, transform_points
 from avatar.io.atlases import read_obj_atlas
 from avatar.io.frames import write_manifest
+from avatar.io.ledger import digest_of, file_digest
 from avatar.io.meshes import read_mesh
 from avatar.io.npz import read_arrays, write_arrays, write_whole
 from avatar.io.points import color_bytes, unit_colors
 from avatar.records import BodyFit, Frame, Scan, Template
 
 log = logging.getLogger(__name__)
+
+BODY, MEAN = "body", "mean_body"  # keys of outfit.yaml
+BODY_FILES = {BODY: "template.npz", MEAN: "mean.npz"}  # where a body is that outfit.yaml gives no path
 
 REQUIRED = {"scan_pc": "float M 3", "scan_n": "float M 3"}
 OPTIONAL = {
@@ -42,19 +48,60 @@ OPTIONAL = {
 
 
 class PackedOutfit(Outfit):
-    """Packed frames beside a ``template.npz`` or a ``template.obj`` of the body in its T-pose.
+    """Packed frames beside a body of the person who was scanned (docs/data.md has every key).
 
-    With ``template.npz`` (written by this project or by ``tools/convert_body.py``) what a frame lacks is derived:
-    joint transforms from the pose, or from ``vtransf`` by least squares; ``vtransf`` from joint transforms and
-    skinning weights; body vertices from either. With ``template.obj`` alone nothing is known of the joints, so
-    frames must bring ``body_verts`` and ``vtransf``, and bodies must stand in their root frame already, as those
-    packed by POP do.
+    The body is what ``outfit.yaml`` names under ``body``, or ``template.npz``: a SMPL, SMPL-H or SMPL-X file converted
+    by ``tools/convert_body.py``, or a template of this project (`packed_body`). Then what a frame lacks is derived:
+    joint transforms from the pose, or from ``vtransf`` by least squares; ``vtransf`` from pose or joint transforms;
+    body vertices from any of them. Where several are there, they must agree. With ``template.obj`` alone nothing is
+    known of the joints, so frames must bring ``body_verts`` and ``vtransf``, and bodies must stand in their root frame
+    already, as those packed by POP do.
     """
 
     @cached_property
     def body(self) -> BodyModel | None:
-        """The body of ``template.npz``, or None where there is only a mesh."""
-        return packed_body(self.path / "template.npz") if (self.path / "template.npz").is_file() else None
+        """The body that ``outfit.yaml`` names or ``template.npz`` holds, or None where there is only a mesh."""
+        return self._body_of(BODY)
+
+    @cached_property
+    def mean_body(self) -> BodyModel | None:
+        """The body that ``outfit.yaml`` names as ``mean_body`` or ``mean.npz`` holds; the person's own otherwise."""
+        mean, own = self._body_of(MEAN), self.body
+        if mean is None or own is None:
+            return own
+        if not torch.equal(mean.faces, own.faces) or mean.joint_names != own.joint_names:
+            raise DataError(self.path, "mean_body: expected the faces and joints of body, got others.")
+        return mean
+
+    @cached_property
+    def shared_digest(self) -> str:
+        """One hash over the files that the outfit's frames share, bodies elsewhere included."""
+        files = [self._body_file(key) for key in BODY_FILES]
+        return digest_of([super().shared_digest, *(file_digest(file) for file in files if file and file.is_file())])
+
+    def _body_file(self, key: str) -> Path | None:
+        """The file of one of the outfit's bodies; None where nothing speaks of it."""
+        file, said = self.path / BODY_FILES[key], read_outfit_settings(self.path).get(key)
+        if said is None:
+            return file if file.is_file() else None
+        if not isinstance(said, dict) or not isinstance(said.get("path", ""), str):
+            problem = f"{key}: expected a mapping such as {{path: {BODY_FILES[key]}, betas: []}}, got {said}."
+            raise DataError(self.path / "outfit.yaml", problem)
+        return self.path / said["path"] if "path" in said else file
+
+    def _body_of(self, key: str) -> BodyModel | None:
+        """One of the outfit's bodies; None where nothing speaks of it."""
+        file = self._body_file(key)
+        if file is None:
+            return None
+        settings = dict(read_outfit_settings(self.path).get(key) or {})
+        settings.pop("path", None)
+        try:
+            return body_of_file(file, settings, f"{key}.")
+        except DataError:
+            raise
+        except AvatarError as error:
+            raise DataError(self.path / "outfit.yaml", str(error)) from error
 
     def _read_template(self) -> Template:
         return self.body.template if self.body else _template_of_mesh(self.path / "template.obj")
@@ -75,7 +122,7 @@ class PackedOutfit(Outfit):
                     path, f"{key}: expected {expected} rows as in the template, got {len(stored[key])}.", mend
                 )
         if "pose" in stored:
-            _check_stored_pose(stored["pose"], joints, path)
+            stored["pose"] = _stored_pose(stored["pose"], self.template.joint_names, path)
         stored = {k: v.astype(np.float32) if v.dtype.kind == "f" else v for k, v in stored.items()}
         normals, colors = stored["scan_n"], stored.get("scan_colors")
         scan = Scan(
@@ -88,26 +135,6 @@ class PackedOutfit(Outfit):
         )
         return Frame(name, self.name, split, self._fit(stored, path), scan)
 
-    @torch.no_grad()
-    def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
-        """The wearer in any pose; needs the joints and skinning weights of a ``template.npz``."""
-        if self.body is None:
-            problem = "posing needs skinning weights and joints, and there is only template.obj."
-            raise DataError(self.path, problem, "Add a template.npz with tools/convert_body.py.")
-        check_pose(pose, len(self.body.parents))
-        translation = np.zeros(3, np.float32) if translation is None else np.asarray(translation, np.float32)
-        pose = np.asarray(pose, np.float32)
-        posed = self.body(torch.from_numpy(pose)[None], torch.from_numpy(translation)[None])
-        root = invert_rigid(posed.joint_transforms[0, 0])
-        return BodyFit(
-            vertices=posed.vertices[0].numpy(),
-            vertex_transforms=posed.vertex_transforms[0].numpy(),
-            joint_transforms=posed.joint_transforms[0].numpy(),
-            pose_vertices=transform_points(root, posed.vertices[0]).numpy(),
-            translation=translation,
-            pose=pose,
-        )
-
     def _scan_faces(self, stored: dict[str, np.ndarray], path: Path) -> np.ndarray | None:
         """Faces over the scan points, where the frame has them."""
         faces = stored.get("scan_faces")
@@ -118,32 +145,58 @@ class PackedOutfit(Outfit):
         return faces.astype(np.int64)
 
     def _fit(self, stored: dict[str, np.ndarray], path: Path) -> BodyFit:
-        """The body of a frame, with what the file lacks derived from what it has."""
-        template = self.template
-        joint_transforms = self._joint_transforms(stored, path)
+        """The body of a frame, with what the file lacks derived from what it has, and the rest of it compared."""
+        template, vertices, posed = self.template, stored.get("body_verts"), None
+        if "pose" in stored:
+            posed = self.fit_pose(stored["pose"], stored.get("translation"))
+            if vertices is not None and "translation" not in stored:
+                posed = self.fit_pose(stored["pose"], (vertices - posed.vertices).mean(axis=0))
+        joint_transforms = self._joint_transforms(stored, posed, path)
         if "vtransf" in stored:
-            vertex_transforms = _whole_transforms(stored, template.vertices.numpy(), path)
+            transforms = _whole_transforms(stored, path)
+        elif posed is not None:
+            transforms = posed.vertex_transforms
         else:
-            blended = blend_transforms(template.weights, torch.from_numpy(joint_transforms)[None])[0]
-            vertex_transforms = _through(blended.numpy(), template.vertices.numpy(), stored.get("body_verts"))
-        vertices = stored.get("body_verts")
+            transforms = self._skin(joint_transforms)
         if vertices is None:
-            vertices = transform_points(torch.from_numpy(vertex_transforms), template.vertices).numpy()
+            vertices = transform_points(torch.from_numpy(transforms), template.vertices).numpy()
+        self._compare(stored, posed, vertices, path)
         pose_vertices = stored.get("pose_vertices")
-        if pose_vertices is None:
+        if pose_vertices is None and posed is not None and self.mean_body is not self.body:
+            pose_vertices = posed.pose_vertices
+        elif pose_vertices is None:
             root = invert_rigid(torch.from_numpy(joint_transforms[0]))
             pose_vertices = transform_points(root, torch.from_numpy(vertices)).numpy()
         return BodyFit(
             vertices=vertices,
-            vertex_transforms=vertex_transforms,
+            vertex_transforms=_through(transforms, template.vertices.numpy(), vertices),
             joint_transforms=joint_transforms,
             pose_vertices=pose_vertices,
-            translation=stored.get("translation", np.zeros(3, np.float32)),
+            translation=stored.get("translation", np.zeros(3, np.float32) if posed is None else posed.translation),
             pose=stored.get("pose"),
         )
 
-    def _joint_transforms(self, stored: dict[str, np.ndarray], path: Path) -> np.ndarray:
-        """Joint transforms ``(J, 4, 4)``: given, from the pose, or by least squares from vertex transforms."""
+    def _compare(self, stored: dict[str, np.ndarray], posed: BodyFit | None, vertices: np.ndarray, path: Path) -> None:
+        """Refuses a frame whose body in metres, pose, joint transforms and ``vtransf`` contradict its vertices."""
+        check_size(vertices, self.template, path)
+        if posed is not None:
+            check_posed(posed.vertices, vertices, "pose", self.template, path)
+        if "joint_transforms" in stored:
+            skinned = transform_points(torch.from_numpy(self._skin(stored["joint_transforms"])), self.template.vertices)
+            check_posed(skinned.numpy(), vertices, "joint_transforms", self.template, path)
+        if "vtransf" in stored:
+            check_carried(stored["vtransf"], self.template, vertices, path)
+
+    def _skin(self, joint_transforms: np.ndarray) -> np.ndarray:
+        """Vertex transforms ``(V, 4, 4)`` of joint transforms ``(J, 4, 4)``, both posed_from_canonical."""
+        joints, bound = torch.from_numpy(joint_transforms)[None], self.template.canonical_from_bind
+        return skin_transforms(self.template.weights, joints, bound)[0].numpy()
+
+    def _joint_transforms(self, stored: dict[str, np.ndarray], posed: BodyFit | None, path: Path) -> np.ndarray:
+        """Joint transforms ``(J, 4, 4)``: given, from the pose, or by least squares from vertex transforms.
+
+        Skinning weights blend motions from the bind pose, so those are what is solved for.
+        """
         if "joint_transforms" in stored:
             return stored["joint_transforms"]
         if self.body is None:
@@ -151,12 +204,16 @@ class PackedOutfit(Outfit):
                 mend = "Bring them, or put a template.npz with skinning weights beside the frames."
                 raise DataError(path, "expected body_verts and vtransf, as the template has no joints.", mend)
             return np.eye(4, dtype=np.float32)[None]
-        if "pose" in stored:
-            return self.fit_pose(stored["pose"], stored.get("translation")).joint_transforms
+        if posed is not None:
+            return posed.joint_transforms
         if "vtransf" not in stored:
             raise DataError(path, "expected vtransf, joint_transforms or pose to place the body, found none of them.")
-        whole = _whole_transforms(stored, self.template.vertices.numpy(), path)
-        return fit_joint_transforms(whole, self.template.weights.numpy(), self.template.parents)
+        template, transforms = self.template, _whole_transforms(stored, path)
+        whole = torch.from_numpy(_through(transforms, template.vertices.numpy(), stored.get("body_verts")))
+        bound = template.canonical_from_bind
+        from_bind = (whole @ blend_transforms(template.weights, bound[None])[0]).numpy()
+        solved = fit_joint_transforms(from_bind, template.weights.numpy(), template.parents)
+        return solved @ invert_rigid(bound).numpy()
 
 
 def fit_joint_transforms(vertex_transforms: np.ndarray, weights: np.ndarray, parents: Sequence[int]) -> np.ndarray:
@@ -187,18 +244,18 @@ def fit_joint_transforms(vertex_transforms: np.ndarray, weights: np.ndarray, par
     return joints.astype(np.float32)
 
 
-def _whole_transforms(stored: dict[str, np.ndarray], rest: np.ndarray, path: Path) -> np.ndarray:
-    """``vtransf`` as ``(V, 4, 4)`` that carry the template to the posed body.
+def _whole_transforms(stored: dict[str, np.ndarray], path: Path) -> np.ndarray:
+    """``vtransf`` as ``(V, 4, 4)``.
 
     Packed files give the rotation block alone, or a translation that leaves out the subject's place in the world;
-    where the posed vertices are known, the translation follows from them.
+    `_through` puts it right where the posed vertices are known.
     """
     given = stored["vtransf"]
     if given.shape[-1] == 3 and "body_verts" not in stored:
         raise DataError(path, "expected body_verts, as vtransf has no translations.")
     whole = np.tile(np.eye(4, dtype=np.float32), (len(given), 1, 1))
     whole[:, :3, : given.shape[-1]] = given[:, :3]
-    return _through(whole, rest, stored.get("body_verts"))
+    return whole
 
 
 def _through(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None) -> np.ndarray:
@@ -210,19 +267,33 @@ def _through(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None)
     return exact
 
 
-def _check_stored_pose(pose: np.ndarray, joints: int, path: Path) -> None:
-    """Refuses a file's pose that is not axis-angle for the template's joints."""
+def _stored_pose(pose: np.ndarray, joint_names: Sequence[str], path: Path) -> np.ndarray:
+    """A file's pose as axis-angle of the body's joints ``(J, 3)``.
+
+    Joints of hands and face may be missing from the pose, or from the body: they are at rest then.
+
+    Raises:
+        DataError: for another shape, or rotations of joints that the body lacks.
+    """
+    rows, joints, shared = len(pose) if pose.shape[1:] == (3,) else 0, len(joint_names), len(SMPL_JOINTS)
+    if list(joint_names[:shared]) == SMPL_JOINTS and shared <= rows != joints:
+        if np.any(pose[joints:]):
+            problem = f"pose: expected rotations of {joints} joints, it turns joints beyond them."
+            raise DataError(path, problem, "Set body.all_joints: true in outfit.yaml to keep hands and face.")
+        pose = np.concatenate([pose[:joints], np.zeros((max(joints - rows, 0), 3), pose.dtype)])
     try:
         check_pose(pose, joints)
     except AvatarError as error:
         raise DataError(path, str(error)) from error
+    return pose
 
 
 def _template_of_mesh(path: Path) -> Template:
     """A body that is only a mesh, with its UV atlas if it has one: everything hangs on one root joint at the origin."""
     if not path.is_file():
         problem = "expected template.npz or template.obj (the minimal body in its T-pose), there is neither."
-        raise DataError(path.parent, problem, "Make one with tools/convert_body.py.")
+        mend = f"Make one: python tools/convert_body.py <downloaded SMPL file> {path.with_suffix('.npz')}"
+        raise DataError(path.parent, problem, mend)
     mesh = read_mesh(path)
     faces = np.asarray(mesh.faces, np.int64)
     atlas = read_obj_atlas(path, faces, len(mesh.vertices))
@@ -266,11 +337,17 @@ def write_packed_outfit(outfit: Outfit, folder: Path) -> PackedOutfit:
         DataError: for a frame that is not sound.
     """
     folder = Path(folder)
-    write_template(folder / "template.npz", outfit.template)
     settings = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{outfit.dataset}/{outfit.name}"}
+    if outfit.body is None:
+        write_template(folder / BODY_FILES[BODY], outfit.template)
+    else:
+        bodies = {BODY: outfit.body} | ({} if outfit.mean_body is outfit.body else {MEAN: outfit.mean_body})
+        for key, body in bodies.items():
+            write_body(folder / BODY_FILES[key], body)
+            settings[key] = {"canonical": canonical_name(body)}
     write_whole(folder / "outfit.yaml", require("yaml").safe_dump(settings, sort_keys=False).encode())
     for split in SPLITS:
-        names = outfit.frames(split) if (outfit.path / split).is_dir() else ()
+        names = outfit.frames(split) if outfit.has_frames(split) else ()
         for name in names:
             write_packed_frame(folder / split / f"{name}.npz", outfit.load(split, name))
         log.info("%s: %d %s frames packed.", folder, len(names), split)

@@ -67,11 +67,9 @@ def check_frame(frame: Frame, template: Template, path: Path) -> None:
     if len(points) < FEWEST_POINTS:
         problem = f"scan: expected at least {FEWEST_POINTS} points, got {len(points)}."
         raise DataError(path, problem, "Leave the frame out or scan it again.")
-    rest, posed, scan = (_diagonal(cloud) for cloud in (template.vertices.numpy(), body, points))
+    check_size(body, template, path)
+    posed, scan = _diagonal(body), _diagonal(points)
     low, high = SIZE_RATIO
-    if not low <= posed / rest <= high:
-        problem = f"body: expected about {rest:.2f} m across as at rest, got {posed:.4g}."
-        raise DataError(path, problem, _unit_hint(posed))
     if not low <= scan / posed <= high:
         problem = f"scan: expected about {posed:.2f} m across as the body, got {scan:.4g}."
         raise DataError(path, problem, _unit_hint(scan))
@@ -83,6 +81,15 @@ def check_frame(frame: Frame, template: Template, path: Path) -> None:
     overlap = measure_overlap(points, frame.scan.normals, body, faces)
     _check_overlap(overlap, frame.scan, body, faces, path)
     _check_normals(overlap, frame.scan, path)
+
+
+def check_size(body: np.ndarray, template: Template, path: Path) -> None:
+    """Refuses a posed body ``(V, 3)`` in other units than its template. Raises `DataError` with the factor."""
+    rest, posed = _diagonal(template.vertices.numpy()), _diagonal(body)
+    low, high = SIZE_RATIO
+    if not low <= posed / rest <= high:
+        problem = f"body: expected about {rest:.2f} m across as at rest, got {posed:.4g}."
+        raise DataError(path, problem, _unit_hint(posed))
 
 
 def check_pose(pose: np.ndarray, joints: int) -> None:

@@ -39,7 +39,7 @@ class Split:
 def split_outfit(outfit: Outfit, config: SplitConfig | None = None) -> Split:
     """The split of an outfit's training frames, after a check that no test frame is among them."""
     train = outfit.frames("train")
-    test = outfit.frames("test") if (outfit.path / "test").is_dir() else ()
+    test = outfit.frames("test") if outfit.has_frames("test") else ()
     check_leakage(train, test, outfit.name)
     return split_frames(train, config or SplitConfig())
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from avatar.body.model import SMPL_JOINTS
+from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.checks import AvatarError, DataError, check_finite, check_shape, plain_name
 from avatar.io.bvh import BvhMotion, read_bvh
 from avatar.io.npz import read_arrays, write_arrays
-from avatar.io.retargeting import map_joints, retarget
+from avatar.io.retargeting import map_joints, move_body, rest_joints, retarget
 from avatar.records import Motion
 
 log = logging.getLogger(__name__)
@@ -24,7 +25,20 @@ Y_FROM_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # z u
 JOINTS = len(SMPL_JOINTS)
 
 
-def read_motion(path: Path, fps: float | None = None, up: str | None = None) -> Motion:
+def read_body_motion(path: Path, body: BodyModel, fps: float | None = None, up: str | None = None) -> Motion:
+    """A motion file (`read_motion`) as poses of a body's own joints ``(T, J, 3)``.
+
+    BVH skeletons are fitted to the body's own proportions. AMASS translations are SMPL's ``trans`` and are given to
+    the body as they are, as are those of our own files.
+
+    Raises:
+        DataError: as `read_motion`.
+        AvatarError: for a body whose joints have names that are not known.
+    """
+    return move_body(read_motion(path, fps, up, rest_joints(body)), body)
+
+
+def read_motion(path: Path, fps: float | None = None, up: str | None = None, rest: np.ndarray | None = None) -> Motion:
     """Reads a motion by its file's ending: ``.npz`` (AMASS SMPL, SMPL+H or SMPL-X, or our own) or ``.bvh``.
 
     AMASS files are z-up and BVH files y-up unless ``up`` says otherwise; all come out y-up. BVH skeletons are
@@ -34,6 +48,7 @@ def read_motion(path: Path, fps: float | None = None, up: str | None = None) -> 
         path: the file.
         fps: frames per second to resample to; the file's own if None.
         up: ``y`` or ``z``, the axis that points up in the file; the format's own if None.
+        rest: ``(22, 3)`` joints in the T-pose of the body that a BVH skeleton is fitted to; the open body's if None.
 
     Raises:
         DataError: for a missing or damaged file, one without a body's motion, or one whose people lie down because
@@ -43,7 +58,7 @@ def read_motion(path: Path, fps: float | None = None, up: str | None = None) -> 
     path = Path(path)
     if up not in (None, "y", "z"):
         raise AvatarError(f"up: expected y, z or nothing, got {up!r}.")
-    readers = {".npz": _read_npz, ".bvh": _read_bvh}
+    readers = {".npz": _read_npz, ".bvh": partial(_read_bvh, rest=rest)}
     if path.suffix.lower() not in readers:
         raise DataError(path, f"expected a motion file ending in {' or '.join(readers)}, got {path.suffix!r}.")
     motion = readers[path.suffix.lower()](path, up)
@@ -158,7 +173,7 @@ def _read_amass(path: Path) -> Motion:
     return Motion(poses, stored["trans"].astype(np.float32), float(rates[0].reshape(())), path.stem)
 
 
-def _read_bvh(path: Path, up: str | None) -> Motion:
+def _read_bvh(path: Path, up: str | None, rest: np.ndarray | None) -> Motion:
     """A BVH file on our joints; refuses people lying along another axis unless the caller says what is up."""
     bvh = read_bvh(path)
     try:
@@ -171,22 +186,23 @@ def _read_bvh(path: Path, up: str | None) -> Motion:
             )
         elif up is None:
             _check_upright(path, bvh)
-        motion = retarget(bvh, path.stem)
+        motion = retarget(bvh, path.stem, rest)
     except DataError:
         raise
     except AvatarError as error:
         raise DataError(path, str(error)) from error
-    log.info("%s: %d joints of %d mapped by name, size fitted to our legs.", path, len(map_joints(bvh)), len(bvh.names))
+    mapped = len(map_joints(bvh.names, bvh.parents))
+    log.info("%s: %d joints of %d mapped by name, size fitted to the body's legs.", path, mapped, len(bvh.names))
     return motion
 
 
 def _check_upright(path: Path, bvh: BvhMotion) -> None:
     """Refuses a file whose people, on average, stretch along another axis than y."""
-    source = map_joints(bvh)
+    source = map_joints(bvh.names, bvh.parents)
     legs = [source[SMPL_JOINTS.index(f"{side}_ankle")] for side in ("left", "right")]
     upper = source[SMPL_JOINTS.index("left_shoulder")]
     stretch = (bvh.positions[:, upper] - bvh.positions[:, legs].mean(axis=1)).mean(axis=0)
     share = stretch / max(np.linalg.norm(stretch), 1e-12)
     if share[1] < 0.5 and abs(share[2]) > 0.8:
-        mend = "Read it with up='z', or with up='y' if people really lie down."
+        mend = "Give up=z, or up=y if people really lie down."
         raise DataError(path, "expected people upright along y, they are upright along z.", mend)

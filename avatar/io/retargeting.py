@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
+from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.checks import AvatarError
 from avatar.io.bvh import BvhMotion
@@ -43,7 +45,7 @@ NEAR_T_POSE = 65.0  # degrees between a limb at rest and in the T-pose; A-poses 
 CALIBRATION_FRAMES = 200
 
 
-def retarget(bvh: BvhMotion, name: str) -> Motion:
+def retarget(bvh: BvhMotion, name: str, rest: np.ndarray | None = None) -> Motion:
     """The motion of a y-up skeleton on our 22 joints.
 
     Joint rotations in the world are kept, after the difference between the skeleton's rest and the T-pose is taken
@@ -51,11 +53,16 @@ def retarget(bvh: BvhMotion, name: str) -> Motion:
     file's rotations and the shortest turns that point our bones along the file's. Joints the skeleton lacks move
     with their parents. Translations are scaled by the ratio of leg lengths, so the file's units do not matter.
 
+    Args:
+        bvh: the skeleton and its motion.
+        name: of the motion.
+        rest: ``(22, 3)`` joint positions in the T-pose of the body that is to move, metres; the open body's if None.
+
     Raises:
         AvatarError: naming the joints that were not found by any known name.
     """
-    source = map_joints(bvh)
-    rest = open_body(MEAN_SHAPE).template.joints.double().numpy()
+    source = map_joints(bvh.names, bvh.parents)
+    rest = open_body(MEAN_SHAPE).template.joints.double().numpy() if rest is None else rest
     offsets = _rest_positions(bvh)
     aligned = _aligned_rest(source, rest, offsets)
     if aligned is None:
@@ -73,30 +80,78 @@ def retarget(bvh: BvhMotion, name: str) -> Motion:
     return Motion(poses.astype(np.float32), translations.astype(np.float32), bvh.fps, name)
 
 
-def map_joints(bvh: BvhMotion) -> dict[int, int]:
-    """Our joint index to the file's, by common names; the joints between hips and neck are shared over the spine."""
-    plain = {re.sub(r"[^a-z0-9]", "", name.rpartition(":")[2].lower()): i for i, name in enumerate(bvh.names)}
+def move_body(motion: Motion, body: BodyModel) -> Motion:
+    """A motion of our 22 joints as one of a body with other joints, of other names or in another order.
+
+    A joint takes the world rotation of the joint of ours that it is named like (`map_joints`), as both are zero in the
+    T-pose; joints like none of ours (fingers, face) stay at rest relative to their parents.
+
+    Raises:
+        AvatarError: for a body whose names are not known.
+    """
+    if body.joint_names == tuple(SMPL_JOINTS) and body.parents == SMPL_PARENTS:
+        return motion
+    ours = {theirs: joint for joint, theirs in map_joints(body.joint_names, body.parents).items()}
+    turns = _world_rotations(motion.poses)
+    world = np.zeros((len(motion.poses), len(body.parents), 3, 3))
+    poses = np.zeros((len(motion.poses), len(body.parents), 3), np.float32)
+    for joint, parent in enumerate(body.parents):
+        above = world[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), world[:, 0].shape)
+        world[:, joint] = turns[:, ours[joint]] if joint in ours else above
+        poses[:, joint] = Rotation.from_matrix(np.swapaxes(above, 1, 2) @ world[:, joint]).as_rotvec()
+    return replace(motion, poses=poses)
+
+
+def rest_joints(body: BodyModel) -> np.ndarray:
+    """Where our 22 joints are in a body's T-pose, ``(22, 3)`` metres; those it lacks lie at their parents."""
+    theirs, places = map_joints(body.joint_names, body.parents), body.zero_joints.double().cpu().numpy()
+    rest = np.zeros((len(SMPL_JOINTS), 3))
+    for joint, parent in enumerate(SMPL_PARENTS):
+        rest[joint] = places[theirs[joint]] if joint in theirs else rest[parent]
+    return rest
+
+
+def map_joints(names: Sequence[str], parents: Sequence[int]) -> dict[int, int]:
+    """Our joint index to a skeleton's, by SMPL's names or other common ones.
+
+    The joints between hips and neck are shared over the spine.
+
+    Raises:
+        AvatarError: naming the joints of ours that were not found.
+    """
+    exact = {SMPL_JOINTS.index(name): index for index, name in enumerate(names) if name in SMPL_JOINTS}
+    if all(SMPL_JOINTS.index(joint) in exact for joint in NEEDED):
+        return dict(sorted(exact.items()))
+    plain = {re.sub(r"[^a-z0-9]", "", name.rpartition(":")[2].lower()): i for i, name in enumerate(names)}
     plain = {re.sub(r"^mixamorig\d*", "", name): index for name, index in plain.items()}
     found = {}
-    for joint, names in NAMES.items():
-        index = next((plain[name] for name in names if name in plain), None)
+    for joint, known in NAMES.items():
+        index = next((plain[name] for name in known if name in plain), None)
         if index is not None:
             found[SMPL_JOINTS.index(joint)] = index
     found.setdefault(0, 0)
     missing = [joint for joint in NEEDED if SMPL_JOINTS.index(joint) not in found]
     if missing:
         raise AvatarError(
-            f"joints: expected the names of a Mixamo, CMU or LAFAN skeleton, found none for {', '.join(missing)} "
-            f"among {', '.join(bvh.names[:40])}."
+            f"joints: expected the names of a SMPL, Mixamo, CMU or LAFAN skeleton, found none for {', '.join(missing)} "
+            f"among {', '.join(names[:40])}."
         )
     upper = found.get(SMPL_JOINTS.index("neck"), found[SMPL_JOINTS.index("left_shoulder")])
     chain = []
-    while (upper := bvh.parents[upper]) > found[0]:
+    while (upper := parents[upper]) > found[0]:
         chain.insert(0, upper)
     chain = [index for index in chain if index not in found.values()]
     spine = {1: ("spine3",), 2: ("spine1", "spine3")}.get(len(chain), ("spine1", "spine2", "spine3"))
     found |= {SMPL_JOINTS.index(joint): index for joint, index in zip(reversed(spine), reversed(chain))}
     return dict(sorted(found.items()))
+
+
+def _world_rotations(poses: np.ndarray) -> np.ndarray:
+    """Rotations of our joints in the world ``(T, 22, 3, 3)`` of a motion's poses ``(T, 22, 3)``."""
+    own = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
+    for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
+        own[:, joint] = own[:, parent] @ own[:, joint]
+    return own
 
 
 def _mapped_parent(joint: int, source: dict[int, int]) -> int:

@@ -8,9 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from avatar.checks import AvatarError
 from avatar.data.layouts import find_outfit
-from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.evaluation.floors import score_body_floor, score_sampling_floor
@@ -19,7 +17,7 @@ from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.ledger import Ledger
-from avatar.io.motions import read_motion
+from avatar.io.motions import read_body_motion
 from avatar.io.npz import write_whole
 from avatar.nn.decoders import Normals
 from avatar.pipeline.methods import is_implicit, load_avatar
@@ -36,6 +34,7 @@ class PredictConfig:
     split: str = "test"  # or validation, the training frames that the run held back, or train
     motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
     fps: float = 30.0  # frames a second a motion is resampled to
+    up: str | None = None  # y or z, which axis of the motion's file points up; its format's own if null
     points: int = 50000  # 1,000 to 400,000
     surface: ExtractionConfig = field(default_factory=ExtractionConfig)  # of an implicit avatar
     checkpoint: str = "last"  # or best, on the held-back frames
@@ -74,7 +73,7 @@ def run_outfits(avatar: TrainedAvatar, data_root: Path | None) -> list[Outfit]:
     outfits = replace(avatar.config, data_root=data_root or avatar.config.data_root).outfits()
     return [
         outfit.with_validation(split_outfit(outfit, avatar.config.split).validation)
-        if (outfit.path / "train").is_dir()
+        if outfit.has_frames("train")
         else outfit
         for outfit in outfits
     ]
@@ -89,7 +88,7 @@ def predict(config: PredictConfig) -> list[Path]:
     """Predicts every outfit of a run; gives the folders of point clouds.
 
     Raises:
-        AvatarError: when a motion is asked for and the body cannot be posed (packed data has no body model).
+        DataError: when a motion is asked for and an outfit has only a mesh of its body.
     """
     avatar = load_avatar(config.run, config.checkpoint, config.device)
     folders = []
@@ -103,9 +102,7 @@ def predict(config: PredictConfig) -> list[Path]:
             else:
                 predict_frames(avatar, outfit, config.split, folders[-1], config.points)
             continue
-        if not isinstance(outfit, OpenOutfit):
-            raise AvatarError(f"motion: {outfit.name} has no body model to pose; use split instead.")
-        motion = read_motion(config.motion, config.fps)
+        motion = read_body_motion(config.motion, outfit.posable_body(), config.fps, config.up)
         folders.append(predictions_folder(config.run, motion.name, outfit.name))
         if is_implicit(avatar):
             meshes = meshes_folder(config.run, motion.name, outfit.name)

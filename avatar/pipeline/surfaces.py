@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avatar.checks import AvatarError, DataError, check_name
-from avatar.data.open_layout import OpenOutfit
 from avatar.export.animation import write_animation, write_usd_meshes, write_usd_points
 from avatar.export.meshing import MeshingReport, PoissonConfig, mesh_folder
 from avatar.export.pictures import frame_camera, render_points
 from avatar.export.rigged import write_rigged_glb
 from avatar.io.meshes import read_mesh
-from avatar.io.motions import read_motion
+from avatar.io.motions import read_body_motion
 from avatar.io.points import read_points
 from avatar.pipeline.methods import is_implicit, load_avatar
 from avatar.pipeline.scores import meshes_folder, predictions_folder, run_outfits
@@ -40,6 +39,7 @@ class ExportConfig:
     predictions: str = "walk"  # the motion that was predicted
     fps: float = 30.0
     motion: Path | None = None  # the motion's file, for the rigged body's joint tracks
+    up: str | None = None  # y or z, which axis of the motion's file points up; its format's own if null
     data_root: Path | None = None  # where the data are now; where they were at training if null
 
     def __post_init__(self):
@@ -99,8 +99,8 @@ def export(config: ExportConfig) -> list[Path]:
         if meshes:
             write_usd_meshes(target / "meshes.usdc", (read_mesh(path) for path in meshes), config.fps)
             written.append(target / "meshes.usdc")
-        if isinstance(outfit, OpenOutfit):
-            motion = read_motion(config.motion, config.fps) if config.motion else None
+        if outfit.body is not None:
+            motion = read_body_motion(config.motion, outfit.body, config.fps, config.up) if config.motion else None
             write_rigged_glb(target / "body.glb", outfit.body, motion)
             written.append(target / "body.glb")
     return written

@@ -95,7 +95,7 @@ class CanonicalizeConfig:
         """The frames that are canonicalized: first those of training, which are learned from, then those of test."""
         outfit = self.find_outfit()
         names = name_frames([outfit], "train", [split_outfit(outfit, self.split).train])
-        if (outfit.path / "test").is_dir():
+        if outfit.has_frames("test"):
             names += name_frames([outfit], "test", [outfit.frames("test")])
         return FrameDataset([outfit], names, points=1, cache_bytes=FRAMES_ROOM)
 

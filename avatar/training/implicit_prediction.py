@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from avatar.checks import AvatarError, check_shape
-from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
 from avatar.implicit.avatar import sample_mesh
 from avatar.implicit.extraction import ExtractionConfig
@@ -83,7 +82,7 @@ def predict_implicit_frames(
 
 def predict_implicit_motion(
     avatar: TrainedAvatar,
-    outfit: OpenOutfit,
+    outfit: Outfit,
     motion: Motion,
     clouds: Path,
     meshes: Path,
@@ -92,7 +91,7 @@ def predict_implicit_motion(
 ) -> list[Path]:
     """Writes ``<motion>.<frame>.ply``, points and surfaces, for every frame of a motion; gives those of points."""
     check_outfit(avatar, outfit)
-    check_shape("poses", motion.poses, "T J 3", J=len(avatar.template.parents))
+    check_shape("poses", motion.poses, "T J 3", J=len(outfit.posable_body().parents))
     written, done, made_by = [], Ledger(clouds), avatar_digest(avatar)
     for frame in tracked(range(len(motion.poses)), f"predict {motion.name}"):
         name = f"{motion.name}.{frame:05d}"

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from avatar.checks import AvatarError, check_shape
-from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
 from avatar.geometry.chunks import UNIT, in_chunks
 from avatar.io.ledger import Ledger, digest_of, keyed
@@ -135,11 +134,11 @@ def outfit_index(avatar: TrainedAvatar, name: str) -> int:
     return avatar.config.outfit.index(name)
 
 
-def predict_motion(avatar: TrainedAvatar, outfit: OpenOutfit, motion: Motion, folder: Path, points: int) -> list[Path]:
+def predict_motion(avatar: TrainedAvatar, outfit: Outfit, motion: Motion, folder: Path, points: int) -> list[Path]:
     """Writes ``<folder>/<motion>.<frame>.ply`` for every frame of a motion; points keep their order over time."""
     index = outfit_index(avatar, outfit.name)
     samples = template_samples(avatar, points)
-    check_shape("poses", motion.poses, "T J 3", J=len(outfit.body.parents))
+    check_shape("poses", motion.poses, "T J 3", J=len(outfit.posable_body().parents))
     written, done, made_by = [], Ledger(folder), avatar_digest(avatar)
     for frame in tracked(range(len(motion.poses)), f"predict {motion.name}"):
         name = f"{motion.name}.{frame:05d}"

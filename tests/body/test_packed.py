@@ -65,9 +65,20 @@ def test_file_of_vertices_and_dense_weights_poses_like_its_body(tmp_path):
     torch.testing.assert_close(again(pose).vertices, body(pose).vertices, atol=1e-5, rtol=1e-5)
 
 
-def test_pose_blendshapes_cannot_be_written(tmp_path):
-    with pytest.raises(AvatarError, match="pose blendshapes"):
-        write_body(tmp_path / "template.npz", random_body(correctives=True))
+def test_bind_pose_and_pose_blendshapes_are_kept(tmp_path):
+    """What `write_body` keeps in full; of `write_template` the bind pose follows from ``canonical_from_bind``."""
+    body, pose = random_body(correctives=True).float(), random_pose(2, 5).float()
+    write_body(tmp_path / "body.npz", body)
+    torch.testing.assert_close(packed_body(tmp_path / "body.npz")(pose).vertices, body(pose).vertices)
+    body = random_body().float()
+    write_template(tmp_path / "template.npz", body.template)
+    torch.testing.assert_close(packed_body(tmp_path / "template.npz")(pose).vertices, body(pose).vertices)
+
+
+def test_a_bind_pose_that_cannot_be_undone_is_refused(tmp_path):
+    path = write(tmp_path / "template.npz", canonical_from_bind=np.zeros((5, 4, 4)))
+    with pytest.raises(DataError, match=r"template\.npz.*singular"):
+        packed_body(path)
 
 
 def test_sparse_weights_keep_the_largest_and_sum_to_one():
