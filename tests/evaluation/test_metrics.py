@@ -70,6 +70,15 @@ def test_rotated_normals():
     assert measure("normal_consistency", comparison) == pytest.approx(2 * math.sin(angle / 2))
 
 
+def test_metrics_are_shown_in_the_unit_that_their_scale_gives():
+    scales = {"1e-4 m²": 1e4, "1e-1": 10, "cm": 1, "%": 100, "mm": 1e3, "mm/frame²": 1e3, "1": 1}
+    assert {name: metric.scale for name, metric in METRICS.items()} == {
+        name: scales[metric.shown_in] for name, metric in METRICS.items()
+    }
+    higher = {name for name, metric in METRICS.items() if metric.higher_is_better}
+    assert higher == {"f_score_5mm", "f_score_1cm"}
+
+
 def test_normals_are_scaled_to_length_one():
     points, normals = plane()
     assert measure("normal_l1", compare((points, 3 * normals), plane())) == 0
