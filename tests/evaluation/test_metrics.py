@@ -184,8 +184,9 @@ def test_penetration_without_a_body_says_so():
         measure("penetration_share", compare(plane(), plane()))
 
 
-def test_mesh_prediction_is_measured_by_its_surface(sphere_cloud):
-    scan = sphere_cloud(400, 1.02, 0)
+@pytest.mark.parametrize("radius", [1.02, 0.98])
+def test_mesh_prediction_is_measured_by_its_surface(sphere_cloud, radius):
+    scan = sphere_cloud(400, radius, 0)
     mesh = sphere_body(1.0)
     comparison = compare(sphere_cloud(50, 3.0, 1), scan, mesh=mesh)
     assert measure("s2m_cm", comparison) == pytest.approx(2.0, abs=0.05)
