@@ -72,4 +72,6 @@ def test_an_asymmetric_template_is_refused():
 def test_coins_follow_from_seed_and_step():
     coins = torch.stack([mirror_coins(3, step, 8) for step in range(200)])
     assert torch.equal(coins[5], mirror_coins(3, 5, 8))
+    assert not torch.equal(coins, torch.stack([mirror_coins(4, step, 8) for step in range(200)]))
+    assert not torch.equal(coins[0], coins[1])
     assert 0.45 < coins.float().mean() < 0.55

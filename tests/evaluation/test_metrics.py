@@ -70,6 +70,15 @@ def test_rotated_normals():
     assert measure("normal_consistency", comparison) == pytest.approx(2 * math.sin(angle / 2))
 
 
+def test_metrics_are_shown_in_the_unit_that_their_scale_gives():
+    scales = {"1e-4 m²": 1e4, "1e-1": 10, "cm": 1, "%": 100, "mm": 1e3, "mm/frame²": 1e3, "1": 1}
+    assert {name: metric.scale for name, metric in METRICS.items()} == {
+        name: scales[metric.shown_in] for name, metric in METRICS.items()
+    }
+    higher = {name for name, metric in METRICS.items() if metric.higher_is_better}
+    assert higher == {"f_score_5mm", "f_score_1cm"}
+
+
 def test_normals_are_scaled_to_length_one():
     points, normals = plane()
     assert measure("normal_l1", compare((points, 3 * normals), plane())) == 0
@@ -175,8 +184,9 @@ def test_penetration_without_a_body_says_so():
         measure("penetration_share", compare(plane(), plane()))
 
 
-def test_mesh_prediction_is_measured_by_its_surface(sphere_cloud):
-    scan = sphere_cloud(400, 1.02, 0)
+@pytest.mark.parametrize("radius", [1.02, 0.98])
+def test_mesh_prediction_is_measured_by_its_surface(sphere_cloud, radius):
+    scan = sphere_cloud(400, radius, 0)
     mesh = sphere_body(1.0)
     comparison = compare(sphere_cloud(50, 3.0, 1), scan, mesh=mesh)
     assert measure("s2m_cm", comparison) == pytest.approx(2.0, abs=0.05)

@@ -55,6 +55,15 @@ def test_trimming_opens_gaps_wider_than_the_largest_hole():
     assert inside.min() == pytest.approx(0.1, abs=0.015)
 
 
+def test_trimming_goes_by_the_distance_along_the_surface_and_to_it():
+    """A surface that runs 2 cm beside its points is theirs; one half a metre away, with no rim in sight, is not."""
+    x, y = (values.reshape(-1) for values in np.meshgrid(*[(np.arange(100) + 0.5) / 100] * 2))
+    cloud = PointCloud(np.stack([x, y, 0 * x], axis=1), np.tile([0, 0, 1.0], (len(x), 1)))
+    for height, kept in ((0.02, 1), (0.5, 0)):
+        raised = Mesh(grid(101).vertices + [0, 0, height], grid(101).faces)
+        assert area(trim_surface(raised, cloud, 0.1, 0.01)) == pytest.approx(kept, abs=1e-9)
+
+
 def test_trimming_drops_parts_below_the_smallest_share():
     def islands(x, y):
         return (x < 0.6) | ((x > 0.8) & (y < 0.2))

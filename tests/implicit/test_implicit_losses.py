@@ -74,6 +74,12 @@ def test_weights_count_and_a_weight_of_zero_drops_its_term():
         torch.testing.assert_close(without.total, terms.total - terms.weighted[name], rtol=1e-4, atol=1e-5)
 
 
+def test_paper_weights_are_the_defaults():
+    config = ImplicitLossConfig()
+    assert [getattr(config, term) for term in TERMS] == [1, 1, 1, 0.1, 1, 1]
+    assert config.sharpness == 100
+
+
 def test_gradients_are_finite_where_slopes_vanish():
     gradients = torch.zeros(1, 4, 3, requires_grad=True)
     normals = torch.zeros(1, 4, 3)

@@ -11,7 +11,7 @@ from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate, sample_surface
 from avatar.geometry.transforms import transform_directions, transform_points
-from avatar.nn.closet import ClosetAvatar, PoseLocality, Skinning
+from avatar.nn.closet import ClosetAvatar, ClosetConfig, PoseLocality, Skinning
 from avatar.nn.decoders import Decoded
 from avatar.nn.hierarchy import HierarchyConfig
 from avatar.nn.locality import LocalPoseConfig
@@ -86,6 +86,7 @@ def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
     scale, skin = model.config.offset_scale, interpolate(model.skin_normals, samples)
     for frame, outfit in enumerate(batch.outfit_ids):
         garment = model.surface_features(model.codes[None, outfit], samples)
+        torch.testing.assert_close(garment[0, :, -3:], interpolate(TEMPLATE.vertices, samples))
         pose = interpolate(model.pose_encoder(batch.pose_vertices[None, frame]), samples)
         template, wrinkles = model.garment_decoder(garment), model.pose_decoder(torch.cat([pose, garment], dim=-1))
         expected = {
@@ -154,13 +155,23 @@ def test_frames_do_not_see_each_other():
     torch.testing.assert_close(model(alone, samples).points, model(batch, samples).points[:1], rtol=1e-5, atol=1e-5)
 
 
-def test_pose_noise_acts_in_training_only():
+def test_sizes_of_pop_are_the_defaults_and_fresh_codes_are_small():
+    config = ClosetConfig()
+    assert (config.offset_scale, config.code_std, config.code_channels, config.pose_noise) == (0.02, 0.01, 64, 0)
+    assert float(avatar(code_std=0.3).codes.detach().std()) == pytest.approx(0.3, rel=0.1)
+
+
+def test_pose_noise_acts_in_training_only(monkeypatch):
     batch, samples = random_batch(), template_points()
     quiet, noisy = avatar(), avatar(pose_noise=0.1)
     torch.testing.assert_close(noisy(batch, samples).points, quiet(batch, samples).points)
     torch.manual_seed(0)
     first = noisy.train()(batch, samples).points
     assert (first - noisy(batch, samples).points).abs().max() > 1e-6
+    encode, seen = noisy.pose_encoder.forward, []
+    monkeypatch.setattr(noisy.pose_encoder, "forward", lambda vertices: seen.append(vertices) or encode(vertices))
+    noisy(batch, samples)
+    assert float((seen[0] - batch.pose_vertices).std()) == pytest.approx(0.1, rel=0.1)  # metres
 
 
 def test_every_parameter_gets_a_gradient():

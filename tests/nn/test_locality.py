@@ -72,6 +72,12 @@ def test_the_canonical_pose_is_all_zeros(body):
     assert relative_rotations(at_rest, body.parents).abs().max() < 1e-6
 
 
+def test_places_are_seen_in_waves_of_powers_of_two_times_pi():
+    point = torch.tensor([0.1, -0.4, 0.9])
+    waves = [wave(factor * torch.pi * point) for factor in (1, 2, 4) for wave in (torch.sin, torch.cos)]
+    torch.testing.assert_close(fourier_features(point, 3), torch.cat([point, *waves]))
+
+
 def test_first_layer_equals_one_on_gated_rotations_and_positions(body):
     template = body.template
     torch.manual_seed(0)

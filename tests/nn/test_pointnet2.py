@@ -85,6 +85,15 @@ def test_interpolation_returns_coarse_values_at_coarse_points():
     torch.testing.assert_close(level.spread(coarse)[:, shared], coarse, rtol=1e-5, atol=1e-5)
 
 
+def test_encoder_goes_down_and_up_with_each_level_s_own_features_joined():
+    torch.manual_seed(0)
+    encoder = PointNet2(sphere_template(), 3, PointNet2Config(SIZES, ((8,), (9,)), ((7,), (4,)))).eval()
+    features = torch.randn(2, 162, 3)
+    fine = encoder.abstractions[0](features)
+    up = encoder.propagations[0](encoder.abstractions[1](fine), fine)
+    torch.testing.assert_close(encoder(features), encoder.propagations[1](up, features))
+
+
 def test_encoder_treats_frames_independently_and_sees_far_parts():
     torch.manual_seed(0)
     template = sphere_template()

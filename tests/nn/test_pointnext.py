@@ -9,6 +9,7 @@ from avatar.nn.pointnet2 import PointNet2Config
 from avatar.nn.pointnext import InvertedResidual, Neighbourhoods, PointNeXt
 
 SIZES = HierarchyConfig(points=(40, 10), radii=(0.5, 1.5), neighbours=6)
+WIDE = HierarchyConfig(points=(40, 10), radii=(0.5, 0.9), neighbours=40)  # all that a ball holds
 
 
 def test_inverted_residual_equals_its_layers_applied_to_every_neighbour():
@@ -30,17 +31,19 @@ def test_inverted_residual_equals_its_layers_applied_to_every_neighbour():
 
 
 def test_levels_see_positions_in_units_of_their_radius_and_blocks_twice_as_far():
-    encoder = PointNeXt(TEMPLATE, 3, PointNet2Config(SIZES, ((16, 4), (32, 8)), ((8,), (4,))))
-    levels = build_levels(TEMPLATE.vertices, SIZES)
-    for stage, level, radius in zip(encoder.abstractions, levels, SIZES.radii):
+    encoder = PointNeXt(TEMPLATE, 3, PointNet2Config(WIDE, ((16, 4), (32, 8)), ((8,), (4,))))
+    levels = build_levels(TEMPLATE.vertices, WIDE)
+    for stage, level, radius in zip(encoder.abstractions, levels, WIDE.radii):
         down, block = stage
         torch.testing.assert_close(down.level.positions * radius, level.positions)
         torch.testing.assert_close(down.level.finer_positions * radius, level.finer_positions)
         assert torch.equal(down.level.groups, level.groups)
         around = block.aggregation.level
         torch.testing.assert_close(around.positions * 2 * radius, level.positions)
+        expected = ball_query(level.positions, level.positions, 2 * radius, min(WIDE.neighbours, len(level.groups)))
+        assert torch.equal(around.groups, expected)
         reach = (level.positions[around.groups] - level.positions[:, None]).norm(dim=-1)
-        assert reach.max() <= 2 * radius + 1e-6
+        assert radius < reach.max() <= 2 * radius + 1e-6
     assert block.mixing[0].out_features == 32 and block.mixing[0].in_features == 8
 
 

@@ -39,6 +39,8 @@ def test_full_network_has_the_published_sizes():
     assert parameters(model.pose_decoder) == 600_326
     assert parameters(model) - model.codes.numel() == 11_255_718
     assert model.codes.shape == (1, 64, 128, 128)
+    assert float(model.codes.detach().std()) == pytest.approx(0.01, rel=0.01)
+    assert PopConfig().offset_scale == 0.02
 
 
 def test_points_are_the_transformed_offset_on_the_posed_body():

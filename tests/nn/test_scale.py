@@ -70,6 +70,8 @@ def test_frame_is_two_edges_and_a_normal_as_long_as_edges_are():
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0))).Q
     turn = turn * turn.det().sign()
     torch.testing.assert_close(model.patch_frames(posed @ turn.T + 2), turn @ frames, rtol=1e-4, atol=1e-4)
+    both = model.patch_frames(torch.cat([posed, 2 * posed]))  # a mean over each body's own edges
+    torch.testing.assert_close(both, torch.cat([frames, 2 * frames]))
 
 
 @pytest.mark.parametrize("pose_feature", list(PoseFeature))
@@ -132,6 +134,7 @@ def test_pointnet_does_not_know_the_order_of_points():
     torch.manual_seed(0)
     net, cloud = PointNet(5, PointNetConfig((8, 16), ())).eval(), torch.randn(2, 30, 3)
     torch.testing.assert_close(net(cloud[:, torch.randperm(30)]), net(cloud))
+    torch.testing.assert_close(net(cloud[:, torch.arange(30).repeat(2)[:45]]), net(cloud))  # a maximum, no mean
     assert net.train()(cloud[:1]).shape == (1, 5)
 
 

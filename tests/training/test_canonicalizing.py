@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from avatar.body.packed import read_template
 from avatar.body.skinning import skin_transforms
 from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.losses import TERMS
+from avatar.canonical.losses import TERMS, canonicalization_loss
 from avatar.canonical.posed import DrawConfig, prepare_scan, to_root_frame
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset
@@ -102,6 +103,69 @@ def test_rates_fall_at_half_and_three_quarters():
     assert [rate_factor(share, 0.1) for share in (0, 0.49, 0.5, 0.74, 0.75, 1)] == pytest.approx(
         [1, 1, 0.1, 0.1, 0.01, 0.01]
     )
+
+
+def test_each_stage_follows_its_own_schedule(tmp_path, monkeypatch):
+    trainer, seen = make_trainer(tmp_path, first_steps=4, second_steps=8, first_lr=0.01, second_lr=0.002), []
+
+    def watch(cycle, batch, template, config, progress):
+        seen.append((trainer.optimiser.param_groups[0]["lr"], cycle.reposed is not None, progress))
+        return canonicalization_loss(cycle, batch, template, config, progress)
+
+    monkeypatch.setattr(cycles, "canonicalization_loss", watch)
+    drawn = []
+    for trainer.step in range(12):
+        drawn.append(trainer.batch_at(trainer.step).points[:, 0])
+        trainer.train_step()
+    rates, together, progress = zip(*seen)
+    assert rates == pytest.approx([0.01] * 2 + [1e-3, 1e-4] + [0.002] * 4 + [2e-4] * 2 + [2e-5] * 2)
+    assert together == (False,) * 4 + (True,) * 8
+    assert progress == pytest.approx([0] * 4 + [step / 8 for step in range(8)])
+    assert len({tuple(points.flatten().tolist()) for points in drawn}) == 12  # points are drawn anew every step
+
+
+def test_clipping_shortens_the_gradient_before_the_step(tmp_path):
+    free, clipped = make_trainer(tmp_path), make_trainer(tmp_path, clip=1e-9)
+    norms, moved = [], []
+    for trainer in (free, clipped):
+        before = [value.detach().clone() for value in trainer.model.parameters()]
+        norms.append(trainer.train_step()[1])
+        moved.append(max(float((a.detach() - b).abs().max()) for a, b in zip(trainer.model.parameters(), before)))
+    assert norms[0] == norms[1] > 1e-3  # logged unclipped
+    assert moved[0] == pytest.approx(4e-3, rel=1e-2) and moved[1] < 4e-4  # Adam's first step is as long as the rate
+    gradients = torch.cat([value.grad.flatten() for value in clipped.model.parameters() if value.grad is not None])
+    assert float(gradients.norm()) == pytest.approx(1e-9, rel=1e-2)
+
+
+def test_a_code_is_found_at_its_own_falling_rate_from_new_points_every_step(monkeypatch):
+    torch.manual_seed(0)
+    model, seen = Canonicalizer(TEMPLATE, 4, NETS).requires_grad_(False), []
+
+    def steady(cycle, batch, template, config, progress):
+        seen.append((batch.points[0, 0], progress))
+        return SimpleNamespace(total=cycle.codes.sum())
+
+    monkeypatch.setattr(cycles, "canonicalization_loss", steady)
+    config = CycleConfig(code_steps=4, code_lr=0.01, draw=DRAW)
+    found = find_code(model, TEMPLATE, SCANS[2], model.codes[0], config)
+    expected = model.codes[0] - 0.01 * (1 + 1 + 0.1 + 0.01)  # Adam under a constant gradient moves by the rate
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    assert [progress for _, progress in seen] == [0, 0.25, 0.5, 0.75]
+    assert len({tuple(point.tolist()) for point, _ in seen}) == 4
+
+
+def test_fields_answer_the_same_in_training_and_evaluation():
+    """No validation, code or scan depends on a mode that somebody may forget to set."""
+    torch.manual_seed(0)
+    model = Canonicalizer(TEMPLATE, 2, NETS)
+    points, code, box = SCANS[0].points[None, :50], model.codes[:1], SCANS[0].box[None]
+    answers = [(fields.inverse(points, code, box), fields.separate(points)) for fields in (model.train(), model.eval())]
+    assert all(torch.equal(a, b) for a, b in zip(*answers))
+
+
+def test_rates_of_the_paper_are_the_defaults():
+    config = CycleConfig()
+    assert (config.first_lr, config.second_lr, config.decay, config.clip) == (0.004, 0.001, 0.1, None)
 
 
 def test_non_finite_losses_leave_the_weights_alone_and_end_training(tmp_path):

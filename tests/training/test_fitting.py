@@ -16,10 +16,11 @@ from avatar.data.splits import SplitConfig
 from avatar.geometry.surface import sample_surface
 from avatar.nn.closet import ClosetAvatar, Skinning
 from avatar.training import fitting
+from avatar.training.checkpoints import read_weights
 from avatar.training.fitting import FitConfig, fit_code, fit_outfit
 from avatar.training.losses import LossConfig, point_avatar_loss
 from avatar.training.prediction import body_batch, predict, template_samples
-from avatar.training.runs import MethodChoice, RunConfig, TrainedAvatar, load_run, train_run
+from avatar.training.runs import WEIGHTS, MethodChoice, RunConfig, TrainedAvatar, load_run, train_run
 
 
 def test_only_the_code_is_learned_and_it_fits_the_scan():
@@ -73,21 +74,35 @@ def wardrobe(tmp_path_factory) -> Path:
     return root
 
 
-def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_poses(wardrobe, tmp_path):
+@pytest.fixture(scope="module")
+def settings(wardrobe, tmp_path_factory) -> FitConfig:
+    """Of fitting the third garment with a network that has learned the others."""
     train = quick_training(steps=80, points=1500, scan_points=1500, validate_every=1000)
-    where = {"dataset": "open", "data_root": wardrobe, "runs_root": tmp_path}
+    where = {"dataset": "open", "data_root": wardrobe, "runs_root": tmp_path_factory.mktemp("runs")}
     choice = MethodChoice("closet", "closet", SETTINGS)
     run = train_run(RunConfig(choice, outfit=("tight", "wide"), train=train, split=SplitConfig(0.0), **where))
     loss = LossConfig(normal_start=0.0, offset=20)
-    options = {"steps": 60, "code_lr": 2e-2, "points": 3000, "scan_points": 3000, "loss": loss}
-    folder = fit_outfit(FitConfig(run=run, outfit="unseen", **options, **where))
-    base, fitted = load_run(run), load_run(folder)
+    return FitConfig(run, outfit="unseen", steps=60, code_lr=2e-2, points=3000, scan_points=3000, loss=loss, **where)
+
+
+@pytest.mark.parametrize(("asked", "fitted"), [(None, "rise.00000"), ("rise.00003", "rise.00003")])
+def test_the_scan_that_is_fitted_is_the_first_or_the_one_asked_for(settings, monkeypatch, asked, fitted):
+    seen = []
+    monkeypatch.setattr(fitting, "fit_code", lambda avatar, batch, config: seen.append(batch) or avatar.model.codes[:1])
+    folder = fit_outfit(replace(settings, frame=asked, name=f"frame-{asked}"))
+    assert seen[0].names == (fitted,)
+    assert read_weights(folder / WEIGHTS, ("fitted_to",))[1]["fitted_to"] == fitted
+
+
+def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_poses(settings):
+    folder = fit_outfit(settings)
+    base, fitted = load_run(settings.run), load_run(folder)
     assert (folder.parents[2].name, fitted.config.outfit, fitted.steps) == ("closet-fitted", ("unseen",), 60)
     for name, value in base.model.state_dict().items():
         assert name == "codes" or torch.equal(value, fitted.model.state_dict()[name]), name
     assert len(fitted.model.codes) == 1
 
-    outfit = find_outfit(wardrobe, "open", "unseen", fitted.config.scan)
+    outfit = find_outfit(settings.data_root, "open", "unseen", fitted.config.scan)
 
     def error(avatar: TrainedAvatar, code: torch.Tensor) -> float:
         avatar.model.codes = torch.nn.Parameter(code[None])

@@ -12,6 +12,7 @@ from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError, DataError
 from avatar.data.splits import SplitConfig
 from avatar.implicit.extraction import ExtractionConfig
+from avatar.implicit.probing import ProbeConfig
 from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
@@ -19,7 +20,9 @@ from avatar.records import Scan
 from avatar.settings import settings_to_dict
 from avatar.simulate.sequences import authored_motion
 from avatar.training.canonicalizing import CanonicalizeConfig, Skinning, train_canonicalizer
+from avatar.training.checkpoints import load_checkpoint
 from avatar.training.implicit_batches import CanonicalFrames, canonical_frame
+from avatar.training.implicit_loop import ImplicitTrainConfig, ImplicitTrainer
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
 from avatar.training.implicit_runs import load_implicit, train_implicit
 from avatar.training.logs import read_log
@@ -87,6 +90,8 @@ def test_training_learns_and_logs_every_term(settings, trained):
         assert float(train[-1][name]) < 0.6 * float(train[0][name])
     assert float(held[-1]["surface"]) < 0.02
     assert float(train[-1]["lr"]) < 0.05 * settings.train.lr
+    lowest = min(float(row["surface"]) for row in held)
+    assert load_checkpoint(trained / "checkpoints", "best")["score"] == pytest.approx(lowest, rel=1e-4)
 
 
 def test_predictions_lie_on_the_posed_scans(trained, tiny_outfit, tmp_path):
@@ -146,6 +151,57 @@ def test_every_kind_of_pose_input_trains_and_comes_back(settings):
         choice = MethodChoice("scanimate", f"scanimate_{kind}", with_avatar(pose=kind))
         avatar = load_implicit(train_implicit(replace(settings, method=choice, train=budget)))
         assert avatar.model.config.pose.value == kind
+
+
+@pytest.fixture
+def make_trainer(trained, tiny_outfit, tmp_path):
+    """Trainers of copies of the trained avatar, with options of training and settings of the implicit loop."""
+
+    def make(settings: ImplicitTrainConfig | None = None, **options) -> ImplicitTrainer:
+        avatar = load_implicit(trained)
+        train = replace(avatar.config.train, schedule=Schedule.constant, **options)
+        probes = ProbeConfig(near_points=60, box_points=20, rim_points=20)
+        settings = replace(settings or ImplicitTrainConfig(), probes=probes)
+        return ImplicitTrainer(avatar.model, tiny_outfit.template.vertices, train, settings, tmp_path)
+
+    return make
+
+
+def test_rates_warm_up_and_decay(make_trainer):
+    trainer, factors = make_trainer(ImplicitTrainConfig(), steps=8, warmup=2), []
+    for trainer.step in range(8):
+        factors.append(trainer.rate_factor())
+    assert factors == pytest.approx([0.5, 1, 1, 1, 0.1, 0.1, 0.01, 0.01])  # at half and three quarters, as the paper's
+    trainer = make_trainer(ImplicitTrainConfig(decay_at=()), steps=8)
+    trainer.config.schedule, trainer.step = Schedule.cosine, 4
+    assert trainer.rate_factor() == pytest.approx(0.505)
+
+
+def test_clipping_shortens_the_gradient_before_the_step(make_trainer, frames):
+    batch, norms, moved = CanonicalFrames(frames, 50, seed=3).batch_at(0, 2), [], []
+    for clip in (None, 1e-9):
+        trainer = make_trainer(clip=clip, lr=1e-3, steps=8)
+        before = [value.detach().clone() for value in trainer.learned]
+        norms.append(trainer.train_step(batch)[1])
+        moved.append(max(float((a.detach() - b).abs().max()) for a, b in zip(trainer.learned, before)))
+    assert norms[0] == norms[1] > 1e-3  # logged unclipped
+    assert moved[0] == pytest.approx(1e-3, rel=1e-2) and moved[1] < 1e-4  # Adam's first step is as long as the rate
+    gradients = torch.cat([value.grad.flatten() for value in trainer.learned if value.grad is not None])
+    assert float(gradients.norm()) == pytest.approx(1e-9, rel=1e-2)
+
+
+def test_validation_is_a_mean_over_frames_at_the_same_points_in_any_mode(make_trainer, frames):
+    trainer, held_back = make_trainer(steps=8), CanonicalFrames(frames[:3], 50, seed=3)
+    values = trainer.validate(held_back.ordered())
+    single = [trainer.validate(held_back.ordered()[row : row + 1]) for row in range(3)]
+    for name, value in values.items():
+        assert value == pytest.approx(np.mean([frame[name] for frame in single]), rel=1e-5), name
+    trainer.step = 5
+    trainer.model.train()
+    assert trainer.validate(held_back.ordered()) == values
+    batch = held_back.batch_at(0, 2)
+    losses = [float(trainer.losses(batch, key).total.detach()) for key in (0, 0, 1)]
+    assert losses[0] == losses[1] != losses[2]  # points in space follow from the step
 
 
 @pytest.fixture

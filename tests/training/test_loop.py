@@ -14,6 +14,7 @@ from spheres import TEMPLATE, random_batch, small_config
 from avatar.checks import AvatarError, DataError
 from avatar.io import npz
 from avatar.nn.closet import ClosetAvatar
+from avatar.training import loop
 from avatar.training.checkpoints import load_checkpoint
 from avatar.training.locks import HELD, lock_folder
 from avatar.training.logs import read_log
@@ -130,7 +131,11 @@ def test_log_has_every_term_of_every_step_once_even_after_resuming(tmp_path):
     fit(make_trainer(tmp_path, steps=5, save_every=2, validate_every=5))
     rows = read_log(tmp_path / "metrics.csv")
     assert [int(row["step"]) for row in rows if row["split"] == "train"] == [1, 2, 3, 4, 5]
-    assert [int(row["step"]) for row in rows if row["split"] == "validation"][-1] == 5
+    assert [int(row["epoch"]) for row in rows if row["split"] == "train"] == [0, 1, 1, 2, 2]  # of two steps
+    held = [row for row in rows if row["split"] == "validation"]
+    assert int(held[-1]["step"]) == 5
+    lowest = min(float(row["chamfer"]) for row in held)
+    assert load_checkpoint(tmp_path / "checkpoints", "best")["score"] == pytest.approx(lowest, rel=1e-4)
     assert all(math.isfinite(float(row[term])) for row in rows for term in (*TERMS, "loss", "chamfer"))
 
 
@@ -145,6 +150,10 @@ def test_clock_ends_training_and_drives_progress(tmp_path):
     fit(trainer)
     assert 1 <= trainer.step < 100_000
     assert trainer.progress() >= 1
+    trainer.step, trainer.seconds = 10_000, 0.3
+    assert trainer.progress() == pytest.approx(0.5)  # of 0.6 seconds
+    trainer.step = 70_000
+    assert trainer.progress() == pytest.approx(0.7)
 
 
 def test_rates_follow_their_schedule(tmp_path):
@@ -184,6 +193,13 @@ def test_codes_and_networks_move_at_their_own_rates(tmp_path):
     moved = changes(make_trainer(tmp_path, lr=1e-2, code_lr=3e-4, warmup=4))
     assert moved.pop("codes") == pytest.approx(3e-4 / 4, rel=1e-3)
     assert max(moved.values()) == pytest.approx(1e-2 / 4, rel=1e-3)
+    assert make_trainer(tmp_path, lr=1e-2, warmup=4).train_step(random_batch())[1] == pytest.approx(1e-2 / 4)  # logged
+
+
+def test_rates_of_pop_are_the_defaults():
+    config = TrainConfig()
+    assert (config.lr, config.code_lr, config.batch, config.schedule) == (3e-4, 5e-4, 4, Schedule.constant)
+    assert (config.warmup, config.clip, config.mirror, config.fresh_points) == (0, None, False, False)
 
 
 def test_clipping_shortens_the_gradient_before_the_step_and_logs_it_unclipped(tmp_path):
@@ -198,6 +214,15 @@ def test_clipping_shortens_the_gradient_before_the_step_and_logs_it_unclipped(tm
     assert max(changes(make_trainer(tmp_path, clip=1e-9)).values()) < 1e-3  # a tenth of the rate: the step was short
 
 
+def test_late_loss_terms_follow_the_progress_and_count_in_validation(tmp_path, monkeypatch):
+    trainer, seen = make_trainer(tmp_path, steps=30), []
+    monkeypatch.setattr(loop, "point_avatar_loss", lambda *given: seen.append(given[-1]) or point_avatar_loss(*given))
+    for trainer.step in (0, 15):
+        trainer.train_step(random_batch())
+    trainer.validate([random_batch()])
+    assert seen == [0, 0.5, 1]
+
+
 def test_validation_asks_the_evaluated_network_and_leaves_it_as_it_was(tmp_path):
     trainer = make_trainer(tmp_path)
     trainer.train_step(random_batch())
@@ -210,7 +235,7 @@ def test_validation_asks_the_evaluated_network_and_leaves_it_as_it_was(tmp_path)
     for batch in batches:
         terms = point_avatar_loss(model(batch, trainer.samples_at(-1)), batch, trainer.config.loss, 1.0)
         raw, share = terms.raw, len(batch.names) / 5  # a mean over frames, not over batches
-        expected["loss"] += share * float(terms.total)
+        expected["loss"] += share * float(terms.total.detach())
         expected["chamfer"] += share * float(raw["scan_to_points"] + raw["points_to_scan"])
         expected["normal"] += share * float(raw["normal"])
     assert {name: values[name] for name in expected} == pytest.approx(expected, rel=1e-5)

@@ -5,7 +5,7 @@ import torch
 
 from avatar.checks import AvatarError
 from avatar.records import Batch, Prediction
-from avatar.training.losses import Chamfer, LossConfig, point_avatar_loss
+from avatar.training.losses import TERMS, Chamfer, LossConfig, point_avatar_loss
 
 
 def plane(count: int, height: float, generator: torch.Generator) -> torch.Tensor:
@@ -76,6 +76,42 @@ def test_regularisers_are_mean_squares_with_their_weights():
     assert terms.weighted["wrinkle_normal"].item() == pytest.approx(3 * 0.48, rel=1e-5)
     assert terms.weighted["code"].item() == pytest.approx(2 * 0.09, rel=1e-5)
     torch.testing.assert_close(terms.total, sum(terms.weighted.values()))
+
+
+def test_every_term_pulls_at_what_it_measures():
+    """Each alone has a gradient, and to its own input only; both Chamfer halves reach the points."""
+    inputs = ("points", "normals", "offsets", "wrinkle_offsets", "wrinkle_normals", "codes")
+    targets, scan = dict(zip(TERMS, ("points", *inputs))), torch.rand(2, 20, 3)
+    for term, chamfer in [*((term, Chamfer.point) for term in TERMS), ("points_to_scan", Chamfer.plane)]:
+        values = {name: torch.rand(2, 20, 3, requires_grad=True) for name in inputs}
+        points, normals, *_ = values.values()
+        others = {name: values[name] for name in inputs[2:]}
+        prediction, batch = make(points, normals, scan, up(scan), **others)
+        config = LossConfig(chamfer, **(dict.fromkeys(TERMS, 0.0) | {term: 1.0}))
+        point_avatar_loss(prediction, batch, config, 1.0).total.backward()
+        reached = {name for name, value in values.items() if value.grad is not None and value.grad.any()}
+        assert reached == {targets[term]}, term
+
+
+def test_each_frame_is_compared_with_its_own_scan():
+    torch.manual_seed(0)
+    unit = torch.nn.functional.normalize
+    points, scan = torch.randn(3, 30, 3), torch.randn(3, 40, 3)
+    normals, scan_normals = unit(torch.randn(3, 30, 3), dim=-1), unit(torch.randn(3, 40, 3), dim=-1)
+    for chamfer in Chamfer:
+        whole, *single = (
+            point_avatar_loss(*make(points[rows], normals[rows], scan[rows], scan_normals[rows]), config, 1.0).raw
+            for config in [LossConfig(chamfer)]
+            for rows in (slice(3), slice(1), slice(1, 2), slice(2, 3))
+        )
+        for name, value in whole.items():
+            torch.testing.assert_close(value, sum(frame[name] for frame in single) / 3)
+
+
+def test_weights_of_pop_are_the_defaults():
+    config = LossConfig()
+    assert [getattr(config, term) for term in TERMS] == [1e4, 1e4, 1, 2e3, 0, 0, 1]
+    assert config.normal_start == 0.6 and config.chamfer is Chamfer.point
 
 
 def test_loss_pulls_points_onto_the_scan():
