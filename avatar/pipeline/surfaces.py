@@ -84,6 +84,7 @@ def export(config: ExportConfig) -> list[Path]:
     Meshes are there when the sequence was meshed, joint tracks when its motion file is given.
     """
     avatar, written = load_avatar(config.run), []
+    motion = read_motion(config.motion, config.fps) if config.motion else None
     for outfit in run_outfits(avatar, config.data_root):
         folder = predictions_folder(config.run, config.predictions, outfit.name)
         paths = sorted(folder.glob("*.ply"))
@@ -100,7 +101,6 @@ def export(config: ExportConfig) -> list[Path]:
             write_usd_meshes(target / "meshes.usdc", (read_mesh(path) for path in meshes), config.fps)
             written.append(target / "meshes.usdc")
         if isinstance(outfit, OpenOutfit):
-            motion = read_motion(config.motion, config.fps) if config.motion else None
             write_rigged_glb(target / "body.glb", outfit.body, motion)
             written.append(target / "body.glb")
     return written
