@@ -14,7 +14,7 @@ from avatar.checks import AvatarError, DataError
 from avatar.config import CONF, settings_class
 from avatar.config import compose_settings as load
 from avatar.pipeline.methods import find_settings
-from avatar.settings import settings_from_dict
+from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.verbs import VERBS
 
 ROOT = Path(__file__).parents[1]
@@ -28,6 +28,14 @@ def test_every_verb_composes_and_has_its_tool(verb):
     assert type(load(verb)) is settings_class(verb)
     assert (ROOT / "tools" / f"{verb}.py").is_file()
     assert (CONF / f"{verb}.yaml").read_text().startswith(f"# python tools/{verb}.py")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_no_option_of_a_verb_is_taken_for_a_choice_among_files(verb):
+    """An option with the name of a folder of `conf/` chooses one of its files, whatever verb it is given to."""
+    chosen = {str(name) for entry in yaml.safe_load((CONF / f"{verb}.yaml").read_text())["defaults"] for name in entry}
+    groups = {path.name for path in CONF.iterdir() if path.is_dir()}
+    assert groups & settings_to_dict(VERBS[verb]()).keys() <= chosen
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -137,7 +137,7 @@ def test_foreign_predictions_are_scored_from_their_folder(job, capsys):
     folder = config.folder / "predictions" / "test" / "tiny"
     settings = EvaluateConfig(
         predictions=folder,
-        method="theirs",
+        label="theirs",
         dataset=config.dataset,
         outfit="tiny",
         data_root=config.data_root,

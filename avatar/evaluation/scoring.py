@@ -145,8 +145,8 @@ def score_predictions(
         AvatarError: naming the frame, when a prediction is not sound.
     """
     names = frame_names(outfit, split)
-    clouds = _find_files(Path(folder), names, (".ply",))
-    surfaces = _find_files(Path(meshes), names, (".ply", ".obj")) if meshes is not None else {}
+    clouds = find_predictions(Path(folder), names, (".ply",))
+    surfaces = find_predictions(Path(meshes), names, (".ply", ".obj")) if meshes is not None else {}
 
     def compare(frame: Frame) -> Comparison:
         path = clouds[frame.name]
@@ -195,8 +195,12 @@ def frame_names(outfit: Outfit, split: str) -> list[str]:
     return names
 
 
-def _find_files(folder: Path, names: list[str], suffixes: tuple[str, ...]) -> dict[str, Path]:
-    """The file of every frame. Missing ones are an error that names them, extra ones a warning."""
+def find_predictions(folder: Path, names: Sequence[str], suffixes: tuple[str, ...] = (".ply",)) -> dict[str, Path]:
+    """The file of every frame in a folder of predictions; files of no frame are a warning.
+
+    Raises:
+        DataError: when there is no such folder, or naming the frames that have no file.
+    """
     if not folder.is_dir():
         raise DataError(folder, "there is no such folder of predictions.", "Run tools/predict.py first.")
     there = {path.name: path for path in sorted(folder.iterdir()) if path.suffix in suffixes}

@@ -31,8 +31,7 @@ class SeamTest:
     @property
     def name(self) -> str:
         """The run in tables."""
-        parts = [part for part in (self.label.variant, f"seed {self.label.seed}" if self.label.seed else "") if part]
-        return f"{self.label.method} ({', '.join(parts)})" if parts else self.label.method
+        return name_of(self.label)
 
     def mean(self, key: SeamKey) -> FrameMean:
         """A metric over the points of all frames."""
@@ -40,6 +39,22 @@ class SeamTest:
         points = sum(value.points for value in values)
         total = sum(value.mean * value.points for value in values)
         return FrameMean(total / points if points else float("nan"), points)
+
+
+def name_of(label: Label) -> str:
+    """A run in tables."""
+    parts = [part for part in (label.variant, f"seed {label.seed}" if label.seed else "") if part]
+    return f"{label.method} ({', '.join(parts)})" if parts else label.method
+
+
+def check_baseline(names: Sequence[str], baseline: str) -> None:
+    """Refuses a baseline that is none of the runs in a table.
+
+    Raises:
+        AvatarError: naming those there are.
+    """
+    if baseline not in names:
+        raise unknown_name("baseline", baseline, names)
 
 
 def to_csv(tests: Sequence[SeamTest]) -> str:
@@ -72,8 +87,7 @@ def seam_differences(tests: Sequence[SeamTest], baseline: str, confidence: float
         AvatarError: when no run has the baseline's name.
     """
     names = [test.name for test in tests]
-    if baseline not in names:
-        raise unknown_name("baseline", baseline, names)
+    check_baseline(names, baseline)
     base, others = tests[names.index(baseline)], [test for test in tests if test.name != baseline]
     body = []
     for metric in ("distance", "angle"):

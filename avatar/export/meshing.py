@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -207,6 +208,16 @@ def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndar
     if lengths.min() < 1e-6:
         raise MeshingError(f"normals: expected directions, got {int((lengths < 1e-6).sum())} of length zero.")
     return points, normals / lengths
+
+
+def require_poisson() -> None:
+    """Refuses a machine without open3d, in no time: it is not imported.
+
+    Raises:
+        AvatarError: with the line that installs it.
+    """
+    if find_spec("open3d") is None:
+        raise AvatarError(f"meshing needs open3d. Run: {install_line('open3d')}")
 
 
 @dataclass(frozen=True)

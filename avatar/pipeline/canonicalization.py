@@ -12,13 +12,14 @@ import torch
 
 from avatar.canonical.rivals import SkinningSource
 from avatar.canonical.scans import canonicalize_scan
+from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset
 from avatar.evaluation.canonical_scores import canonical_table, score_canonicalization
-from avatar.evaluation.canonical_truth import Canonicalized
+from avatar.evaluation.canonical_truth import Canonicalized, check_truth
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.evaluation.scoring import Label
 from avatar.evaluation.tables import to_markdown
-from avatar.export.drawing import Camera, frame_camera
+from avatar.export.drawing import Camera, frame_camera, load_pyvista
 from avatar.export.pictures import contact_sheet, render_mesh, render_points, save_picture
 from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.npz import write_whole
@@ -40,14 +41,36 @@ PICTURE = (480, 480)
 
 
 def canonicalize(config: CanonicalizeConfig) -> Path:
-    """Trains or resumes a run's canonicalizer, writes every frame's canonical scan, draws some; gives the folder."""
+    """Trains or resumes a run's canonicalizer, writes every frame's canonical scan, draws some; gives the folder.
+
+    Raises:
+        AvatarError: before any training, when scores are asked for of data without truth, or pictures on a machine that
+            cannot draw.
+    """
     frames = config.frames()
+    check_scored(config, frames)
+    if config.pictures:
+        load_pyvista()
     train_canonicalizer(config, frames)
     canonicalize_frames(config, frames)
     draw_canonical_scans(config, frames)
     if config.scored:
         score_canonical_scans(config, frames)
     return config.folder
+
+
+def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
+    """Refuses to score scans of which nobody knows where they belong at rest.
+
+    Raises:
+        AvatarError: for data that were not simulated.
+    """
+    if not config.scored:
+        return
+    try:
+        check_truth(frames.frame(0).scan)
+    except AvatarError as error:
+        raise AvatarError(f"scored, {config.dataset}/{config.outfit}: {error} Hint: leave out scored.") from error
 
 
 def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> Scores:

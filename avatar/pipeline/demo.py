@@ -10,13 +10,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
+from avatar.checks import AvatarError
 from avatar.evaluation.scoring import ScoreConfig
+from avatar.export.drawing import load_pyvista
+from avatar.export.meshing import require_poisson
 from avatar.io.npz import write_whole
 from avatar.pipeline.canonicalization import canonicalize
 from avatar.pipeline.reporting import ReportConfig, report
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import MeshConfig, mesh
 from avatar.training.canonicalizing import CanonicalizeConfig
+from avatar.training.prediction import check_count
 from avatar.training.runs import MethodChoice, RunConfig, train_run
 
 log = logging.getLogger(__name__)
@@ -32,9 +36,22 @@ class DemoConfig(RunConfig):
     meshes: int = 4  # frames meshed
     score: ScoreConfig = field(default_factory=ScoreConfig)
 
+    def __post_init__(self):
+        super().__post_init__()
+        check_count(self.points)
+        if self.method.name != "closet":
+            raise AvatarError(
+                f"method: expected CloSET or one of its variants, got {self.method.name}; its floor is CloSET's. "
+                f"Hint: train others by tools/train.py method={self.method.variant}."
+            )
+
 
 def demo(config: DemoConfig) -> Path:
-    """Runs the main job; gives ``<runs>/demo/summary.json``, which says what was made and how long each stage took."""
+    """Runs the main job; gives ``<runs>/demo/summary.json``, which says what was made and how long each stage took.
+
+    Raises:
+        AvatarError: before any work, without test frames, and on a machine that cannot mesh or draw.
+    """
     seconds: dict[str, float] = {}
 
     @contextmanager
@@ -48,6 +65,10 @@ def demo(config: DemoConfig) -> Path:
     budget = replace(settings.train, minutes=(settings.train.minutes or 2.0) * config.static_share)
     static = MethodChoice("closet", "static", settings.method.settings | {"pose": False})
     where = {key: getattr(settings, key) for key in ("dataset", "data_root", "runs_root", "device")}
+    for outfit in settings.outfits():
+        outfit.frames("test")
+    require_poisson()
+    load_pyvista()
     with stage("canonicalize"):
         carried = [
             canonicalize(replace(config.canonicalizer, outfit=outfit, name=settings.canonical, **where))

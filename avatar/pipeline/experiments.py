@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
+from avatar.checks import AvatarError
+from avatar.data.outfits import SPLITS, VALIDATION
+from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.scoring import ScoreConfig
+from avatar.export.drawing import load_pyvista
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.npz import write_whole
 from avatar.nn.closet import Skinning
-from avatar.pipeline.canonicalization import score_canonical_scans
+from avatar.pipeline.canonicalization import check_scored, score_canonical_scans
 from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.methods import train
-from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict, scores_file
+from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict, read_all_scores, scores_file
 from avatar.settings import settings_to_dict
 from avatar.training.canonicalizing import CanonicalizeConfig, canonicalize_frames, train_canonicalizer
 from avatar.training.distributed import current_team
 from avatar.training.implicit_runs import METHOD as SCANIMATE
 from avatar.training.locks import lock_folder
+from avatar.training.prediction import check_count
 from avatar.training.runs import WEIGHTS, RunConfig, Space
 
+log = logging.getLogger(__name__)
 SCORED = "scored.txt"  # in a run's folder: what its scores were made of
 
 
@@ -39,6 +46,15 @@ class ExperimentConfig(RunConfig):
     canonicalizer: CanonicalizeConfig = field(default_factory=CanonicalizeConfig)  # of methods that take one
     compare: CompareConfig = field(default_factory=CompareConfig)
 
+    def __post_init__(self):
+        super().__post_init__()
+        check_count(self.points)
+        known, splits = (*SPLITS, VALIDATION), self.compare.splits
+        if unknown := set(splits) - set(known):
+            raise AvatarError(f"compare.splits: expected some of {', '.join(known)}, got {', '.join(sorted(unknown))}.")
+        if VALIDATION in splits and not self.split.validation_share:
+            raise AvatarError("split.validation_share: expected above 0, for compare.splits names validation.")
+
     @property
     def run(self) -> RunConfig:
         """The training run alone, with its full name."""
@@ -53,8 +69,12 @@ def experiment(config: ExperimentConfig) -> Path:
 
     Returns:
         The run's folder.
+
+    Raises:
+        AvatarError: before any work, for what prediction, scores or pictures would refuse after training.
     """
     run, leads = config.run, current_team().leads
+    check_job(config)
     if takes_canonicalizer(run):
         for outfit in run.outfit:
             prepare_canonicalizer(config, outfit)
@@ -62,6 +82,22 @@ def experiment(config: ExperimentConfig) -> Path:
     if leads:
         score_run(config, folder)
     return folder
+
+
+def check_job(config: ExperimentConfig) -> None:
+    """Refuses what could not be predicted, scored or drawn once the run is trained.
+
+    Raises:
+        AvatarError: for a split without frames, scores of canonical scans without truth, a machine that cannot draw.
+    """
+    for split in set(config.compare.splits) - {VALIDATION}:
+        for outfit in config.outfits():
+            outfit.frames(split)
+    for name in config.outfit if takes_canonicalizer(config.run) else ():
+        settings = canonicalizer_of(config, name)
+        check_scored(settings, settings.frames())
+    if config.compare.pictures:
+        load_pyvista()
 
 
 def takes_canonicalizer(run: RunConfig) -> bool:
@@ -123,4 +159,15 @@ def tabulate_experiment(configs: Sequence[ExperimentConfig]) -> Path:
     takers = [config for config in configs if takes_canonicalizer(config.run)]
     folders = [canonicalizer_of(config, outfit).folder for config in takers for outfit in config.outfit]
     scored = [folder for folder in dict.fromkeys(folders) if (folder / "scores.csv").is_file()]
-    return compare(replace(first.compare, runs=runs, runs_root=first.runs_root, canonicalizers=tuple(scored)))
+    settings = replace(first.compare, runs=runs, runs_root=first.runs_root, canonicalizers=tuple(scored))
+    if settings.baseline and not has_baseline(settings):
+        log.warning("No differences to %s: none of the finished jobs is of it.", settings.baseline)
+        settings = replace(settings, baseline="")
+    return compare(settings)
+
+
+def has_baseline(config: CompareConfig) -> bool:
+    """Whether the method that others are set against is a floor, or one of the runs was of it."""
+    files = [scores_file(run, split) for run in config.runs for split in config.splits]
+    methods = {method_key(row) for row in read_all_scores(files).rows}
+    return config.baseline in {*FLOORS[:2], *methods, *map(base_method, methods)}

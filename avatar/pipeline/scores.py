@@ -13,7 +13,7 @@ from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.evaluation.floors import score_body_floor, score_sampling_floor
 from avatar.evaluation.scores import Scores, read_scores, write_scores
-from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
+from avatar.evaluation.scoring import Label, ScoreConfig, find_predictions, score_predictions
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.ledger import Ledger
@@ -52,7 +52,7 @@ class EvaluateConfig:
     score: ScoreConfig = field(default_factory=ScoreConfig)
     data_root: Path | None = None  # where the data are now; where they were at training if null
     predictions: Path | None = None  # a foreign program's folder of <frame>.ply, instead of runs
-    method: str = "foreign"  # its name in the table
+    label: str = "foreign"  # its name in the table
     dataset: str = "sample"  # the data it predicts
     outfit: str = "dress"
     out: Path | None = None  # where the scores of foreign predictions go; beside them if null
@@ -122,7 +122,7 @@ def evaluate(config: EvaluateConfig) -> Scores:
     if config.predictions is not None:
         outfit = find_outfit(config.data_root or Path("data"), config.dataset, config.outfit)
         folder = config.out or config.predictions
-        label, done = Label(config.method), Ledger(folder)
+        label, done = Label(config.label), Ledger(folder)
         scores = score_predictions(config.predictions, outfit, config.split, config.score, label, None, done)
         write_scores(folder / "scores.csv", scores)
         if config.floors:
@@ -134,10 +134,13 @@ def evaluate(config: EvaluateConfig) -> Scores:
 
 
 def score_runs(config: EvaluateConfig) -> Scores:
-    """Scores every outfit of every run, and the floors once an outfit."""
+    """Scores every outfit of every run, and the floors once an outfit; refuses before it begins what is not there."""
     scores, seen = Scores(), set()
-    for run in config.runs:
-        avatar = load_avatar(run)
+    avatars = {run: load_avatar(run) for run in config.runs}
+    for run, avatar in avatars.items():
+        for outfit in run_outfits(avatar, config.data_root):
+            find_predictions(predictions_folder(run, config.split, outfit.name), outfit.frames(config.split))
+    for run, avatar in avatars.items():
         settings = avatar.config
         label = Label(
             settings.method.variant,

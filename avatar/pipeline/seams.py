@@ -8,8 +8,8 @@ from pathlib import Path
 from avatar.checks import AvatarError, check_name
 from avatar.data.outfits import Outfit
 from avatar.evaluation.scoring import Label
-from avatar.evaluation.seam_tables import SeamTest, seam_differences, seam_table, to_csv
-from avatar.evaluation.seams import measure_seams, seam_places
+from avatar.evaluation.seam_tables import SeamTest, check_baseline, name_of, seam_differences, seam_table, to_csv
+from avatar.evaluation.seams import SeamPlaces, measure_seams, seam_places
 from avatar.evaluation.tables import Table, to_markdown
 from avatar.io.npz import write_whole
 from avatar.pipeline.methods import is_implicit, load_avatar
@@ -44,17 +44,17 @@ def seams(config: SeamsConfig) -> Path:
     """Writes ``<out>/<table>.csv`` and ``<table>.md``, which it prints; gives the path of the latter.
 
     Raises:
-        AvatarError: without runs, for implicit ones, and for bodies without UV coordinates.
+        AvatarError: before anything is measured: without runs, for implicit ones, for a baseline that is none of them.
+            For bodies without UV coordinates.
     """
-    if not config.runs:
-        raise AvatarError("runs: expected the folders of trained runs, got none.")
+    asked = runs_by_outfit(config)
+    for mine in asked.values():
+        if config.baseline:
+            check_baseline([name_of(label_of(config, avatar)) for avatar, _ in mine], config.baseline)
     tests: dict[tuple[str, str], list[SeamTest]] = {}
-    for run in config.runs:
-        avatar = load_avatar(run)
-        if is_implicit(avatar):
-            raise AvatarError(f"{run}: an implicit avatar has no points at chosen places of the body. Leave it out.")
-        for outfit in run_outfits(avatar, config.data_root):
-            tests.setdefault((outfit.dataset, outfit.name), []).append(probe_seams(config, avatar, outfit))
+    for key, mine in asked.items():
+        places = seam_places(mine[0][1].template, config.points, config.seed)
+        tests[key] = [probe_seams(config, avatar, outfit, places) for avatar, outfit in mine]
     every = [test for mine in tests.values() for test in mine]
     write_whole(config.out / f"{config.table}.csv", to_csv(every).encode())
     tables: list[Table] = []
@@ -67,22 +67,39 @@ def seams(config: SeamsConfig) -> Path:
     return config.out / f"{config.table}.md"
 
 
-def probe_seams(config: SeamsConfig, avatar: TrainedAvatar, outfit: Outfit) -> SeamTest:
-    """A run asked at the places of an outfit's body, for the frames of a split."""
-    settings, index = avatar.config, outfit_index(avatar, outfit.name)
-    places = seam_places(outfit.template, config.points, config.seed)
-    names = spaced_frames(list(outfit.frames(config.split)), config.frames)
-    frames = []
-    for name in tracked(names, f"seams of {settings.method.variant} on {outfit.name}"):
-        frame = outfit.load(config.split, name)
-        cloud = predict(avatar.model, body_batch([frame.body], index, (name,)), places.samples)
-        frames.append(measure_seams(cloud, frame.scan, places))
-    label = Label(
-        settings.method.variant,
+def runs_by_outfit(config: SeamsConfig) -> dict[tuple[str, str], list[tuple[TrainedAvatar, Outfit]]]:
+    """The runs, loaded, under data set and name of each outfit that they were trained on."""
+    if not config.runs:
+        raise AvatarError("runs: expected the folders of trained runs, got none.")
+    found: dict[tuple[str, str], list[tuple[TrainedAvatar, Outfit]]] = {}
+    for run in config.runs:
+        avatar = load_avatar(run)
+        if is_implicit(avatar):
+            raise AvatarError(f"{run}: an implicit avatar has no points at chosen places of the body. Leave it out.")
+        for outfit in run_outfits(avatar, config.data_root):
+            found.setdefault((outfit.dataset, outfit.name), []).append((avatar, outfit))
+    return found
+
+
+def label_of(config: SeamsConfig, avatar: TrainedAvatar) -> Label:
+    """A run in the table."""
+    return Label(
+        avatar.config.method.variant,
         table=config.table,
-        variant=variant_of(settings),
-        seed=settings.train.seed,
+        variant=variant_of(avatar.config),
+        seed=avatar.config.train.seed,
         steps=avatar.steps,
         commit=current_commit(),
     )
-    return SeamTest(label, outfit.dataset, outfit.name, tuple(frames))
+
+
+def probe_seams(config: SeamsConfig, avatar: TrainedAvatar, outfit: Outfit, places: SeamPlaces) -> SeamTest:
+    """A run asked at places of an outfit's body, for the frames of a split."""
+    index = outfit_index(avatar, outfit.name)
+    names = spaced_frames(list(outfit.frames(config.split)), config.frames)
+    frames = []
+    for name in tracked(names, f"seams of {avatar.config.method.variant} on {outfit.name}"):
+        frame = outfit.load(config.split, name)
+        cloud = predict(avatar.model, body_batch([frame.body], index, (name,)), places.samples)
+        frames.append(measure_seams(cloud, frame.scan, places))
+    return SeamTest(label_of(config, avatar), outfit.dataset, outfit.name, tuple(frames))

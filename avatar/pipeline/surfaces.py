@@ -84,7 +84,13 @@ def export(config: ExportConfig) -> list[Path]:
     Meshes are there when the sequence was meshed, joint tracks when its motion file is given.
     """
     avatar, written = load_avatar(config.run), []
-    for outfit in run_outfits(avatar, config.data_root):
+    outfits = list(run_outfits(avatar, config.data_root))
+    bodies = [outfit.body for outfit in outfits]
+    motions = [
+        read_body_motion(config.motion, body, config.fps, config.up) if config.motion and body is not None else None
+        for body in bodies
+    ]
+    for outfit, body, motion in zip(outfits, bodies, motions):
         folder = predictions_folder(config.run, config.predictions, outfit.name)
         paths = sorted(folder.glob("*.ply"))
         if not paths:
@@ -99,8 +105,7 @@ def export(config: ExportConfig) -> list[Path]:
         if meshes:
             write_usd_meshes(target / "meshes.usdc", (read_mesh(path) for path in meshes), config.fps)
             written.append(target / "meshes.usdc")
-        if outfit.body is not None:
-            motion = read_body_motion(config.motion, outfit.body, config.fps, config.up) if config.motion else None
-            write_rigged_glb(target / "body.glb", outfit.body, motion)
+        if body is not None:
+            write_rigged_glb(target / "body.glb", body, motion)
             written.append(target / "body.glb")
     return written

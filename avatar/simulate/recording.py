@@ -71,6 +71,9 @@ class SimulateConfig:
         check_names("preset", [self.preset], tuple(PRESETS))
         check_names("outfits", self.outfits, OUTFIT_NAMES)
         check_names("shapes", [s for s in self.shapes if not s.endswith(".npz")], open_body_shapes())
+        for shape in self.shapes:
+            if shape.endswith(".npz") and not Path(shape).is_file():
+                raise AvatarError(f"shapes: {shape}: expected a file of tools/make_body.py, there is none.")
         for name in ("train", "test", "workers", "history"):
             if (getattr(self, name) or 0) < 0:
                 raise AvatarError(f"{name}: expected a number of at least 0, got {getattr(self, name)}.")

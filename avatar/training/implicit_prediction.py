@@ -18,7 +18,7 @@ from avatar.io.points import write_points
 from avatar.progress import tracked
 from avatar.records import BodyFit, Motion
 from avatar.settings import settings_to_dict
-from avatar.training.prediction import MAX_POINTS, avatar_digest, pose_digest
+from avatar.training.prediction import avatar_digest, check_count, pose_digest
 from avatar.training.runs import TrainedAvatar
 
 
@@ -36,8 +36,7 @@ def write_frame(
     Raises:
         AvatarError: for a count of points out of 1,000 to 400,000, or when the field has no surface.
     """
-    if not 1000 <= points <= MAX_POINTS:
-        raise AvatarError(f"points: expected 1,000 to {MAX_POINTS:,}, got {points}.")
+    check_count(points)
     joint_transforms = torch.from_numpy(np.asarray(body.joint_transforms, np.float32))
     mesh = avatar.model.posed_mesh(joint_transforms, config)
     write_mesh(meshes / f"{name}.ply", mesh)

@@ -24,14 +24,23 @@ MAX_POINTS = 400_000
 CHUNK = 100_000  # points decoded at once, or fewer where memory runs out; the network is pointwise
 
 
-def template_samples(avatar: TrainedAvatar, points: int, seed: int = 0) -> SurfaceSamples:
-    """The template points a prediction is made at: spread evenly by area, fixed by the seed, or the network's own.
+def check_count(points: int) -> None:
+    """Refuses a number of points that no frame is predicted with.
 
     Raises:
         AvatarError: for a count out of 1,000 to 400,000.
     """
     if not 1000 <= points <= MAX_POINTS:
         raise AvatarError(f"points: expected 1,000 to {MAX_POINTS:,}, got {points}.")
+
+
+def template_samples(avatar: TrainedAvatar, points: int, seed: int = 0) -> SurfaceSamples:
+    """The template points a prediction is made at: spread evenly by area, fixed by the seed, or the network's own.
+
+    Raises:
+        AvatarError: for a count out of 1,000 to 400,000.
+    """
+    check_count(points)
     template, generator = avatar.template, torch.Generator().manual_seed(seed)
     return draw_samples(avatar.model, template.vertices, template.faces, points, generator)
 

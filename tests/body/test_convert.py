@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import torch
-from bodies import random_model
+from bodies import distinct, random_model, write_unwrapped
 
 from avatar.body.convert import convert_body_model
 from avatar.body.open import open_body
@@ -337,20 +337,6 @@ def unwrapped(model: dict, places: np.ndarray) -> dict:
 @pytest.fixture
 def places() -> np.ndarray:
     return np.random.default_rng(3).random((90, 2))
-
-
-def distinct(model: dict) -> dict:
-    """A model whose triangles are 30 different ones of three different vertices."""
-    faces = np.random.default_rng(4).permuted(np.tile(np.arange(40), (30, 1)), axis=1)[:, :3]
-    return model | {"f": faces.astype(np.uint32)}
-
-
-def write_unwrapped(path: Path, model: dict, places: np.ndarray) -> Path:
-    lines = ["v 0 0 0"] * len(model["v_template"]) + [f"vt {u:.9f} {v:.9f}" for u, v in places]
-    for number, face in enumerate(model["f"]):
-        lines.append("f " + " ".join(f"{vertex + 1}/{3 * number + corner + 1}" for corner, vertex in enumerate(face)))
-    path.write_text("\n".join(lines))
-    return path
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".pkl"])

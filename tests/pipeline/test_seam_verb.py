@@ -42,7 +42,8 @@ def test_pop_jumps_at_seams_and_the_surface_nowhere(runs, tmp_path, capsys):
     assert near["pop"]["points"] != "0" and near["pop"]["frames"] == "2" and near["pop"]["dataset"] == "open"
 
 
-def test_what_cannot_be_asked_is_refused(runs, tmp_path):
+def test_what_cannot_be_asked_is_refused_before_anything_is_measured(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr("avatar.pipeline.seams.probe_seams", lambda *_: pytest.fail("something was measured"))
     with pytest.raises(AvatarError, match="folders of trained runs"):
         seams(SeamsConfig())
     with pytest.raises(AvatarError, match="baseline: expected one of pop, got 'csf'"):

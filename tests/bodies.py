@@ -1,8 +1,9 @@
-"""Random bodies of a few vertices for the tests of this folder."""
+"""Random bodies of a few vertices for tests of bodies and commands."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -77,3 +78,18 @@ def random_body(canonical: bool = False, correctives: bool = False) -> BodyModel
         random_pose(5, seed=3) if canonical else None,
         directions if correctives else None,
     )
+
+
+def distinct(model: dict) -> dict:
+    """A model whose triangles are 30 different ones of three different vertices."""
+    faces = np.random.default_rng(4).permuted(np.tile(np.arange(40), (30, 1)), axis=1)[:, :3]
+    return model | {"f": faces.astype(np.uint32)}
+
+
+def write_unwrapped(path: Path, model: dict, places: np.ndarray) -> Path:
+    """An OBJ of a model in which every corner of every triangle has a texture coordinate of its own ``(3 F, 2)``."""
+    lines = ["v 0 0 0"] * len(model["v_template"]) + [f"vt {u:.9f} {v:.9f}" for u, v in places]
+    for number, face in enumerate(model["f"]):
+        lines.append("f " + " ".join(f"{vertex + 1}/{3 * number + corner + 1}" for corner, vertex in enumerate(face)))
+    path.write_text("\n".join(lines))
+    return path

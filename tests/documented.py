@@ -1,0 +1,289 @@
+"""Command lines that the documents print: found, completed, shortened, and run as processes on tiny data."""
+
+from __future__ import annotations
+
+import ast
+import os
+import pickle
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+from bodies import distinct, random_bind, random_model, write_unwrapped
+
+from avatar.body.packed import write_template
+from avatar.io.frames import write_manifest
+from avatar.io.motions import write_motion
+from avatar.simulate.sequences import authored_motion
+
+ROOT = Path(__file__).parents[1]
+PROGRAMS = "python|python3|torchrun|srun|sbatch|make|pip|apt-get|conda|docker|bash|sh"
+COMMAND = re.compile(rf"(?:[A-Z_]+=\S+ )*(?:{PROGRAMS}) \S")
+OUTFITS = ("tee", "dress", "shirt", "skirt", "jacket")
+CLOSET5 = "runs/{}/sample/dress/closet5_2steps_1_seed0"
+POP, CSF, CLOSET = (CLOSET5.format(name) for name in ("pop", "csf", "closet"))
+FIRST = "runs/closet/sample/dress/default"
+TABLE = [f"runs/{name}/sample/dress/table" for name in ("static", "closet")]
+
+# What stands for a placeholder, the first that fits; several values make several commands.
+FILLED = {
+    "[<run>,<run>,<folder>]": [f"[{FIRST},{FIRST.replace('closet', 'static')},theirs]"],
+    "[<run>,<run>]": [f"[{POP},{CLOSET}]"],
+    "[<run of pop>,<run of closet>]": [f"[{POP},{CLOSET}]"],
+    "[<pop>,<csf>,<closet>]": [f"[{POP},{CSF},{CLOSET}]"],
+    "[<static run>,<closet run>]": [f"[{','.join(TABLE)}]"],
+    "<run of several outfits>": ["runs/closet/open/tee+shirt/default"],
+    "<new>": ["skirt"],
+    "<run>": [FIRST],
+    "<motion>": ["walk"],
+    "<folder>": ["theirs"],
+    "<name>": ["csf"],
+    "<table>": ["closet5"],
+    "run=...": [f"run={folder}" for folder in TABLE],
+    ",...]": ["]"],
+}
+
+# Less work for a verb, nothing else; they replace the values that are printed.
+CANONICALIZER = ("train.first_steps=2", "train.second_steps=2", "train.code_steps=1", "pictures=1", "scan.points=2000")
+TRAIN = (
+    "train.steps=2",
+    "train.batch=1",
+    "train.points=500",
+    "train.scan_points=500",
+    "scan.points=2000",
+    "size=small",
+)
+PREDICT = ("points=1000", "surface.resolution=32")
+SHORT = {
+    "train": TRAIN,
+    "fit": ("steps=2", "points=500", "scan_points=500"),
+    "predict": PREDICT,
+    "evaluate": ("score.scan_points=1000",),
+    "compare": ("pictures=1", "resamples=100"),
+    "experiment": (
+        *(*TRAIN, *PREDICT, "score.scan_points=1000", "compare.pictures=1", "compare.resamples=100"),
+        *(f"canonicalizer.{option}" for option in CANONICALIZER),
+    ),
+    "seams": ("points=2000",),
+    "mesh": ("frames=1", "poisson.depth=6"),
+    "report": ("frames=1",),
+    "canonicalize": CANONICALIZER,
+    "demo": (
+        *(*TRAIN, "points=2000", "score.scan_points=1000", "meshes=1", "static_share=1.0"),
+        *(f"canonicalizer.{option}" for option in CANONICALIZER),
+    ),
+    "bench": ("quick=true", "repeats=1", "memory=false"),
+    "torture": (
+        *(
+            "kills=1",
+            "kills_in_saves=1",
+            "flips=5",
+            "truncations=3",
+            "files=20",
+            "names=3",
+            "full_disks=1",
+            "poisons=1",
+        ),
+        *("races=1", "meshes=3", "demo_minutes=0.02", "stream_gb=0.05", "stream_frames=3"),
+    ),
+}
+
+# What a verb promises to leave, with its options filled in.
+PROMISED = {
+    "train": ["runs/{method}/{dataset}/{outfit}/{name}/avatar.safetensors"],
+    "fit": ["runs/closet/open/{outfit}/fitted/avatar.safetensors"],
+    "predict": ["{run}/predictions/{split}/*/*.ply"],
+    "evaluate": ["{scored}/scores*.csv"],
+    "experiment": ["**/{compare.table}.csv", "**/{compare.table}.md"],
+    "compare": ["**/{table}.csv", "**/{table}.md"],
+    "seams": ["**/seams.csv", "**/seams.md"],
+    "mesh": ["{run}/meshes/{split}/*/*.ply", "{run}/meshes/{split}/*/*.obj", "{run}/meshes/{split}/*/*.glb"],
+    "export": [f"{{run}}/export/{{predictions}}/*/{name}" for name in ("points.usdc", "body.glb", "preview.webp")],
+    "report": ["{run}/report.html"],
+    "canonicalize": ["runs/canonical/{dataset}/{outfit}/{name}/scans/t*/*.npz"],
+    "demo": ["runs/demo/summary.json", "runs/closet/sample/{outfit}/demo/report.html"],
+    "simulate": ["data/open/*/manifest.json"],
+    "bench": ["**/bench.csv", "**/bench.md"],
+    "torture": ["**/reliability.csv"],
+    "parameters": ["**/parameters.csv", "**/parameters.md"],
+    "convert_body": ["{1}"],
+    "make_body": ["{0}"],
+    "doctor": [],
+}
+USUAL = {"dataset": "sample", "outfit": "dress", "name": "default", "method": "closet", "split": "test"}
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A command line as some documents print it; ``block`` is the fenced block or the line that it stands in."""
+
+    text: str
+    block: str
+
+
+@dataclass
+class Outcome:
+    """How a command ended: exit code, output, processor and wall time, and promised files that are not there."""
+
+    code: int
+    output: str
+    seconds: float
+    missing: list[str] = field(default_factory=list)
+
+
+def printed_commands() -> list[Printed]:
+    """Every command line of README.md, docs/, the first comment of each file in conf/, and the tools' own help."""
+    found = []
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        found += commands_of_document(path.read_text(), str(path.relative_to(ROOT)))
+    for path in sorted((ROOT / "conf").rglob("*.yaml")):
+        comments = [line[2:] for line in path.read_text().splitlines()[:2] if line.startswith("# ")]
+        found += [Printed(line, str(path.relative_to(ROOT))) for line in comments if COMMAND.match(line)]
+    for path in sorted((ROOT / "tools").glob("*.py")):
+        lines = re.findall(r"python tools/.*", ast.get_docstring(ast.parse(path.read_text())) or "")
+        found += [Printed(line, str(path.relative_to(ROOT))) for line in lines]
+    return [Printed(text, line.block) for line in found for text in variants(line.text)]
+
+
+def commands_of_document(text: str, name: str) -> list[Printed]:
+    """The commands of a Markdown document: lines of fenced blocks and inline code, in the order of the text.
+
+    In a row of a table, options that stand behind a command (`motion=walk.npz`, `--uv body.obj`) make commands of
+    their own with it.
+    """
+    found = []
+    for number, part in enumerate(re.split(r"^```.*$", text, flags=re.MULTILINE)):
+        if number % 2:
+            lines = (re.sub(r"\s+#.*", "", line).strip() for line in part.replace("\\\n", " ").splitlines())
+            found += [Printed(line, f"{name}, block {number // 2 + 1}") for line in lines if COMMAND.match(line)]
+            continue
+        rows = [[line] for line in part.splitlines() if line.startswith("|")]
+        prose = re.split(r"\n\s*\n", "\n".join(line for line in part.splitlines() if not line.startswith("|")))
+        for count, lines in enumerate([*rows, *([text] for text in prose)]):
+            spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", lines[0])]
+            commands = [span for span in spans if COMMAND.match(span)]
+            if lines in rows and len(commands) == 1:
+                options = [span for span in spans if re.fullmatch(r"[a-z_.]+=\S+|--\w+ \S+", span)]
+                commands += [f"{commands[0]} {option}" for option in options]
+            found += [Printed(command, f"{name}, text {number // 2 + 1}.{count + 1}") for command in commands]
+    return found
+
+
+def variants(text: str) -> list[str]:
+    """A line with its optional parts (``[seed=7]``), once for each alternative (``preset=quick|full``)."""
+    text = text.removeprefix("srun ")
+    text = re.sub(r"(?<=\s)\[(\w[\w.]*=(?:\[[^\]]*\]|[^\[\]\s]*))\]", r"\1", text)
+    words = [[word] for word in text.split(" ")]
+    for number, (word,) in enumerate(words):
+        key, _, values = word.rpartition("=")
+        if "|" in values:
+            words[number] = [f"{key}={value}" for value in values.split("|")]
+    return [" ".join(choice) for choice in product(*words)]
+
+
+def filled(text: str) -> list[str]:
+    """The commands to run for a printed line: placeholders filled in, work shortened."""
+    texts = [text]
+    for placeholder, values in FILLED.items():
+        texts = [
+            one.replace(placeholder, value)
+            for one in texts
+            for value in (values if placeholder in one else [placeholder])
+        ]
+    return [shortened(one) for one in texts]
+
+
+def verb_of(text: str) -> str:
+    """The verb of a command: ``train`` of ``python tools/train.py ...``, the line itself where there is none."""
+    named = re.search(r"tools/(\w+)\.py", text)
+    return named.group(1) if named else text
+
+
+def shortened(text: str) -> str:
+    """A command with the options of its verb that make less work, in place of those printed."""
+    options = SHORT.get(verb_of(text), ())
+    if text.startswith("torchrun"):  # a whole number of frames a process
+        options = [option.replace("train.batch=1", "train.batch=4") for option in options]
+    keys = {option.partition("=")[0] for option in options}
+    kept = [word for word in shlex.split(text) if word.partition("=")[0] not in keys]
+    return shlex.join([*kept, *options])
+
+
+def unfilled(text: str) -> list[str]:
+    """What still stands for something else in a command."""
+    return re.findall(r"<[^>]*>|\.\.\.|\$\w+", text)
+
+
+def promised_files(text: str) -> list[str]:
+    """Globs of what a command leaves behind, below the folder it is started in."""
+    words = shlex.split(text)
+    options = dict(word.split("=", 1) for word in words if re.match(r"[a-z_.]+=", word))
+    swept = {key: value.split(",") for key, value in options.items() if not value.startswith("[")}
+    globs = []
+    for values in product(*swept.values()):
+        given = USUAL | options | dict(zip(swept, values))
+        given["outfit"] = "+".join(given["outfit"].strip("[]").split(","))
+        given["split"] = Path(given.get("motion", given.get("predictions", given["split"]))).stem
+        given["scored"] = given.get("predictions") or options.get("runs", "").strip("[]").split(",")[0]
+        if "experiment" in given:
+            given.setdefault("compare.table", given["experiment"])
+        given |= {str(i): word for i, word in enumerate(words[2:])}
+        globs += [
+            re.sub(r"{([\w.]+)}", lambda name, given=given: given[name.group(1)], g) for g in PROMISED[verb_of(text)]
+        ]
+    return list(dict.fromkeys(globs))
+
+
+def run_command(text: str, folder: Path, program: Path, timeout: float = 600) -> Outcome:
+    """Runs a command in a folder, with the program elsewhere and no terminal."""
+    words = shlex.split(text)
+    settings = [words.pop(0) for _ in range(len(words)) if re.match(r"[A-Z_]+=", words[0])]
+    words[0] = str(Path(sys.executable).with_name(words[0]))
+    words = [str(program / word) if word.startswith("tools/") else word for word in words]
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST", "COV"))}
+    environment = kept | {"PYTHONPATH": str(program), "OMP_NUM_THREADS": "1"} | dict(s.split("=", 1) for s in settings)
+    started = time.monotonic()
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    try:
+        done = subprocess.run(words, cwd=folder, env=environment, text=True, check=False, timeout=timeout, **pipes)
+    except subprocess.TimeoutExpired as error:
+        return Outcome(-1, f"no end in {timeout:.0f} s; {error.stdout}", timeout)
+    missing = [glob for glob in promised_files(text) if not any(p.stat().st_size for p in folder.glob(glob))]
+    return Outcome(done.returncode, done.stdout, time.monotonic() - started, missing)
+
+
+def copy_program(folder: Path) -> Path:
+    """A copy of the program whose embedded sample has six train and two test frames an outfit."""
+    for name in ("avatar", "conf", "tools"):
+        shutil.copytree(ROOT / name, folder / name)
+    for outfit in (folder / "avatar/assets/sample").iterdir():
+        for split, count in (("train", 6), ("test", 2)):
+            paths = sorted((outfit / split).glob("*.npz"))
+            for path in paths[count:]:
+                path.unlink()
+        write_manifest(outfit)
+    return folder
+
+
+def prepare_workspace(folder: Path, program: Path) -> Path:
+    """A folder with what a reader of the documents brings: data, a body, a motion, predictions of another program."""
+    sample = program / "avatar/assets/sample"
+    for name in OUTFITS:
+        shutil.copytree(sample / ("tee" if name == "tee" else "dress"), folder / "data/open" / name)
+    write_motion(folder / "walk.npz", authored_motion("walk", fps=30, seconds=0.1))
+    model, places = distinct(vars(random_model("smplx", components=20))), np.random.default_rng(3).random((90, 2))
+    np.savez(folder / "SMPLX_NEUTRAL.npz", **model)
+    (folder / "SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps(distinct(vars(random_model("smpl")))))
+    template = replace(random_bind(), faces=torch.from_numpy(model["f"].astype(np.int64)))
+    write_template(folder / "data/mine/coat/template.npz", template)
+    for name in ("body.obj", "smpl_uv.obj"):
+        write_unwrapped(folder / name, model, places)
+    return folder

@@ -1,0 +1,186 @@
+"""Every command line of README.md, docs/, conf/ and the tools' help, as a process of its own, as printed, on tiny data.
+
+From another folder, without a terminal, with the flags that commands set. Placeholders are filled in and work is made
+less (`documented.FILLED`, `documented.SHORT`); nothing else is changed. What is not run is named in `NOT_RUN`.
+"""
+
+import re
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from documented import (
+    FIRST,
+    PROMISED,
+    ROOT,
+    Outcome,
+    commands_of_document,
+    copy_program,
+    filled,
+    prepare_workspace,
+    printed_commands,
+    promised_files,
+    run_command,
+    shortened,
+    unfilled,
+    variants,
+    verb_of,
+)
+
+NOT_RUN = {  # a line that matches: why no test runs it
+    r"make (demo|test)": "make test is what runs this file; the demo's chain is run by the line of tools/demo.py",
+    r"pip install .*": "installs packages",
+    r"torchrun --nnodes 2 .*": "needs two machines; the line with --standalone is run",
+    r".* hydra/launcher=slurm .*": "needs SLURM; test_multirun runs the same launcher's local form",
+    r"python tools/simulate.py .*": "the cloth solver takes minutes; tests/simulate runs it on a small piece",
+    r"python tools/export_body.py": "maintainer's tool that writes into the program",
+    r"python tools/torture.py(| kills=200 seed=7)": "all trials: tests/pipeline/test_torture.py runs each of them",
+    r"python tools/bench.py( repeats=5)?": "all topics: the lines with only=... are run",
+    r".*only=\[simulation\].*": "the cloth solver takes minutes",
+}
+PREPARED = (  # two series that run side by side before all else: runs, predictions and scores that other lines name
+    (
+        "python tools/train.py -m method=static,closet outfit=dress,tee",
+        f"python tools/predict.py run={FIRST}",
+        f"python tools/predict.py run={FIRST.replace('dress', 'tee')}",
+        "python tools/predict.py run=runs/static/sample/dress/default",
+        "python tools/evaluate.py runs=[runs/static/sample/dress/default,runs/closet/sample/dress/default]",
+        f"python tools/predict.py run={FIRST} motion=walk.npz",
+    ),
+    ("python tools/experiment.py experiment=closet5", "python tools/train.py dataset=open outfit=[tee,shirt]"),
+)
+SLOW = {"experiment": 25, "bench": 20, "torture": 60, "demo": 25, "doctor": 30}  # seconds; 6 for other verbs
+PRINTED = printed_commands()
+
+
+def why_not(text: str) -> str | None:
+    """Why a printed line is not run; None for one that is."""
+    return next((why for pattern, why in NOT_RUN.items() if re.fullmatch(pattern, text)), None)
+
+
+RUN = list(dict.fromkeys(command for line in PRINTED if why_not(line.text) is None for command in filled(line.text)))
+
+
+@pytest.fixture(scope="session")
+def outcomes(request, tmp_path_factory) -> dict[str, Outcome]:
+    """How each of the chosen commands ended. Two series run side by side, each in a folder of its own."""
+    chosen = {
+        item.callspec.params["command"]
+        for item in request.session.items
+        if hasattr(item, "callspec") and "command" in item.callspec.params
+    }
+    base = tmp_path_factory.mktemp("documented")
+    program = copy_program(base / "program")
+    before = {path: path.read_bytes() for path in program.rglob("*") if path.is_file() and path.suffix != ".pyc"}
+    first = prepare_workspace(base / "first", program)
+    found: dict[str, Outcome] = {}
+
+    def run_all(series: tuple[str, ...] | list[str], folder) -> None:
+        for command in series:
+            if command not in found:
+                found[command] = run_command(command, folder, program)
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda series: run_all([shortened(text) for text in series], first), PREPARED))
+        for path in (first / FIRST.replace("dress", "tee") / "predictions/test/tee").glob("*.ply"):
+            (first / "theirs").mkdir(exist_ok=True)
+            shutil.copy2(path, first / "theirs")
+        second = base / "second"
+        shutil.copytree(first, second)
+        list(pool.map(run_all, halves(chosen, found), (first, second)))
+    after = {path: path.read_bytes() for path in program.rglob("*") if path.is_file() and path.suffix != ".pyc"}
+    found["program"] = Outcome(int(before != after), f"written into the program: {set(after) ^ set(before)}", 0)
+    return found
+
+
+def halves(chosen: set[str], done: dict[str, Outcome]) -> tuple[list[str], list[str]]:
+    """The chosen commands that are still to be run, in two series of about the same length; blocks stay together."""
+    blocks: dict[str, list[str]] = {}
+    seen = set(done)
+    for line in PRINTED:
+        for command in filled(line.text) if why_not(line.text) is None else ():
+            if command in chosen and command not in seen:
+                seen.add(command)
+                blocks.setdefault(line.block, []).append(command)
+    series, seconds = ([], []), [0, 0]
+    for block in sorted(blocks.values(), key=lambda block: -sum(SLOW.get(verb_of(text), 6) for text in block)):
+        shorter = seconds.index(min(seconds))
+        series[shorter].extend(block)
+        seconds[shorter] += sum(SLOW.get(verb_of(text), 6) for text in block)
+    return series
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", RUN)
+def test_the_command_does_what_it_says(command, outcomes):
+    outcome = outcomes[command]
+    assert outcome.code == 0, f"{command}\nended with {outcome.code}:\n{outcome.output[-4000:]}"
+    assert outcome.missing == [], f"{command}\nleft nothing at {outcome.missing}:\n{outcome.output[-2000:]}"
+    assert "Traceback" not in outcome.output
+
+
+@pytest.mark.slow
+def test_nothing_is_written_beside_the_program(outcomes):
+    assert outcomes["program"].code == 0, outcomes["program"].output
+
+
+def test_every_line_is_run_or_named_with_its_reason():
+    texts = {line.text for line in PRINTED}
+    stale = [pattern for pattern in NOT_RUN if not any(re.fullmatch(pattern, text) for text in texts)]
+    assert stale == [], "no line is printed that matches"
+    assert {verb_of(command) for command in RUN} <= set(PROMISED), "say in documented.PROMISED what they leave"
+    left = {command: unfilled(command) for command in RUN if unfilled(command)}
+    assert left == {}, "give these a value in documented.FILLED, or name the line in NOT_RUN"
+    verbs = {path.stem for path in (ROOT / "tools").glob("*.py")}
+    assert {verb_of(text) for text in texts} >= verbs, "a tool that no document tells how to start"
+
+
+def test_every_mention_of_a_tool_with_options_is_found():
+    """No line with ``tools/<verb>.py`` and options hides from `commands_of_document` behind an unknown program."""
+    for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        text = re.sub(r"\s*\\\n\s*|\s+", " ", path.read_text())
+        found = " ".join(line.text for line in commands_of_document(path.read_text(), path.name))
+        for mention in re.findall(r"(?<!\w/)\w+\.py \S+=\S+", text):
+            name, option = mention.split(" ")
+            assert f"{name} {option.strip('`.,;:)')}" in found.replace("  ", " "), f"{path.name}: {mention}"
+
+
+def test_lines_are_found_in_blocks_tables_and_prose():
+    text = """Run `python tools/a.py x=1` first, never `train`.
+
+| command | does |
+|---|---|
+| `python tools/b.py run=<run>` | makes it; `motion=walk.npz` for a motion, `--uv body.obj` |
+
+```
+A=1 python tools/c.py one=1 \\
+    two=2          # why
+5 jobs: 4 finished
+srun python tools/d.py size=full
+```
+"""
+    found = [variant for line in commands_of_document(text, "page") for variant in variants(line.text)]
+    assert sorted(" ".join(line.split()) for line in found) == [
+        "A=1 python tools/c.py one=1 two=2",
+        "python tools/a.py x=1",
+        "python tools/b.py run=<run>",
+        "python tools/b.py run=<run> --uv body.obj",
+        "python tools/b.py run=<run> motion=walk.npz",
+        "python tools/d.py size=full",
+    ]
+    assert variants("tool [only=[a,b]] preset=x|y") == ["tool only=[a,b] preset=x", "tool only=[a,b] preset=y"]
+    assert filled("python tools/report.py run=<run>") == [f"python tools/report.py run={FIRST} frames=1"]
+    assert filled("python tools/new.py run=<else>") == ["python tools/new.py 'run=<else>'"]
+    assert unfilled("python tools/new.py 'run=<else>'") == ["<else>"]
+    swept = "python tools/train.py -m method=static,closet outfit=[dress,tee]"
+    assert promised_files(swept) == [
+        f"runs/{method}/sample/dress+tee/default/avatar.safetensors" for method in ("static", "closet")
+    ]
+
+
+def test_a_command_that_fails_or_leaves_nothing_is_seen(tmp_path):
+    (tmp_path / "tools").mkdir()
+    (tmp_path / "tools/report.py").write_text("print('done')")
+    assert run_command("python tools/report.py run=x", tmp_path, tmp_path).missing == ["x/report.html"]
+    (tmp_path / "tools/report.py").write_text("raise SystemExit(2)")
+    assert run_command("python tools/report.py run=x", tmp_path, tmp_path).code == 2
