@@ -23,3 +23,4 @@ if __name__ == "__main__":
     except AvatarError as error:
         sys.exit(f"convert_body: {error}")
     print(f"{paths.target}: {kind} body, {paths.target.stat().st_size / 1e6:.1f} MB")
+    print(f"Name it in the outfit.yaml of packed data (docs/data.md), as body: {{path: {paths.target.resolve()}}}")
