@@ -54,6 +54,7 @@ def convert_body() -> None:
     except AvatarError as error:
         sys.exit(refuse("convert_body", error))
     print(f"{paths.target}: {kind} body, {paths.target.stat().st_size / 1e6:.1f} MB")
+    print(f"Name it in the outfit.yaml of packed data (docs/data.md), as body: {{path: {paths.target.resolve()}}}")
 
 
 def make_body() -> None:

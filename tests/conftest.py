@@ -3,8 +3,10 @@
 import shutil
 
 import pytest
+from smpl_person import BETAS, person_model, write_model, write_person
 from tiny import write_tiny_outfit
 
+from avatar.body.convert import convert_body_model
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.scanner import ScanConfig
 
@@ -24,6 +26,20 @@ def tiny_folder(tmp_path_factory):
 def tiny_outfit(tiny_folder):
     """The tiny outfit, 4,000 scan points a frame: 6 train and 3 test frames of cloth that follows from the pose."""
     return OpenOutfit(tiny_folder, "open", ScanConfig(points=4000))
+
+
+@pytest.fixture(scope="session")
+def person():
+    """The arrays of someone else's SMPL file (`smpl_person`); read only."""
+    return person_model()
+
+
+@pytest.fixture(scope="session")
+def person_folder(person, tmp_path_factory):
+    """A packed outfit of that person, the converted file in it and named in ``outfit.yaml``; read only."""
+    folder = tmp_path_factory.mktemp("mine") / "coat"
+    convert_body_model(write_model(folder.parent / "SMPL.pkl", person), folder / "template.npz")
+    return write_person(folder, person, f"body: {{path: template.npz, betas: {list(BETAS)}}}")
 
 
 @pytest.fixture(scope="session")

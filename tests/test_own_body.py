@@ -10,7 +10,7 @@ import pytest
 from glb import Glb
 from motion_files import write_amass, write_bvh
 from scipy.spatial import cKDTree
-from smpl_person import BETAS, PARENTS, person_model, pose_person, rest_joints, whole_pose, write_model, write_person
+from smpl_person import BETAS, PARENTS, pose_person, rest_joints, whole_pose, write_model, write_person
 
 from avatar.data.layouts import find_outfit
 from avatar.io.meshes import read_mesh
@@ -40,11 +40,6 @@ def run(folder: Path, *lines: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def model() -> dict[str, np.ndarray]:
-    return person_model()
-
-
-@pytest.fixture(scope="module")
 def walk() -> Motion:
     """Three frames of a walk that goes forwards and turns."""
     motion = authored_motion("walk", fps=30, seconds=0.1)
@@ -54,14 +49,14 @@ def walk() -> Motion:
 
 
 @pytest.fixture(scope="module")
-def home(model, walk, tmp_path_factory) -> Path:
+def home(person, walk, tmp_path_factory) -> Path:
     """A folder in which all of it has been done: ``data``, ``runs``, motions."""
     folder = tmp_path_factory.mktemp("own")
-    write_model(folder / "SMPL_MINE.pkl", model)
+    write_model(folder / "SMPL_MINE.pkl", person)
     yaml = f"body:\n  path: ../../bodies/mine.npz\n  betas: {list(BETAS)}\n"
-    write_person(folder / "data" / "mine" / "coat", model, yaml)
+    write_person(folder / "data" / "mine" / "coat", person, yaml)
     write_amass(folder / "amass.npz", walk)
-    write_bvh(folder / "bvh.bvh", walk, rest=rest_joints(model))
+    write_bvh(folder / "bvh.bvh", walk, rest=rest_joints(person))
     run(folder, "convert_body.py SMPL_MINE.pkl data/bodies/mine.npz")
     run(folder, f"train.py dataset=mine outfit=coat {QUICK}")
     predict = f"predict.py run={RUN} points=3000"
@@ -77,9 +72,9 @@ def assert_dressed(points: np.ndarray, body: np.ndarray, near: float = NEAR) -> 
     assert cKDTree(points).query(body)[0].max() < 2 * NEAR
 
 
-def walking(model: dict[str, np.ndarray], walk: Motion) -> list[np.ndarray]:
+def walking(person: dict[str, np.ndarray], walk: Motion) -> list[np.ndarray]:
     """The person in the walk's frames."""
-    return [pose_person(model, whole_pose(p), t).vertices for p, t in zip(walk.poses, walk.translations)]
+    return [pose_person(person, whole_pose(p), t).vertices for p, t in zip(walk.poses, walk.translations)]
 
 
 def test_the_pose_of_a_frame_gives_its_vertices(home):
@@ -101,20 +96,20 @@ def test_test_frames_are_predicted_over_their_bodies(home):
 
 
 @pytest.mark.parametrize("motion", ["amass", "bvh"])
-def test_motions_move_the_person(home, model, walk, motion):
+def test_motions_move_the_person(home, person, walk, motion):
     paths = sorted((home / RUN / "predictions" / motion / "coat").glob("*.ply"))
     assert len(paths) == 3
-    for path, body in zip(paths, walking(model, walk)):
+    for path, body in zip(paths, walking(person, walk)):
         assert_dressed(read_points(path).points, body)
 
 
-def test_meshes_and_caches_are_in_metres_and_upright(home, model, walk):
+def test_meshes_and_caches_are_in_metres_and_upright(home, person, walk):
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
     folder = home / RUN / "export" / "amass" / "coat"
     assert (folder / "preview.webp").stat().st_size > 1000
-    bodies = walking(model, walk)
+    bodies = walking(person, walk)
     meshes = sorted((home / RUN / "meshes" / "amass" / "coat").glob("*.ply"))
     for path, body in zip(meshes, bodies, strict=True):
         assert_dressed(read_mesh(path).vertices, body, MESHED)
@@ -126,9 +121,9 @@ def test_meshes_and_caches_are_in_metres_and_upright(home, model, walk):
             assert_dressed(np.array(found.GetPointsAttr().Get(frame)), body, MESHED)
 
 
-def test_the_rigged_body_walks_as_the_person_does(home, model, walk):
+def test_the_rigged_body_walks_as_the_person_does(home, person, walk):
     """Its vertices are SMPL's without the pose blendshapes, which glTF has no place for."""
     glb = Glb(home / RUN / "export" / "amass" / "coat" / "body.glb")
-    still = model | {"posedirs": 0 * model["posedirs"]}
+    still = person | {"posedirs": 0 * person["posedirs"]}
     for frame, body in enumerate(walking(still, walk)):
         np.testing.assert_allclose(glb.skinned(frame), body, atol=2e-3)  # eight weights a vertex

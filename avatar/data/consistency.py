@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,17 +31,22 @@ def check_joints(template: Template, path: Path) -> None:
     judged = np.isfinite(borders[:, 0]) & (np.arange(len(borders)) > 0)
     if not judged.any():
         return
+    joints, borders = template.joints.numpy().astype(np.float64)[judged], borders[judged]
     scale = max(float(np.ptp(vertices[:, 1])), 1e-6) / 1.7  # limits are those of a person of 1.7 m
-    joints = template.joints.numpy().astype(np.float64)
-    gaps = np.linalg.norm(joints - borders, axis=1)[judged]
-    if gaps.max() <= JOINT_GAP * scale and np.median(gaps) <= JOINTS_GAP * scale:
+
+    def fit(places: np.ndarray) -> bool:
+        gaps = np.linalg.norm(places - borders, axis=1) / scale
+        return gaps.max() <= JOINT_GAP and np.median(gaps) <= JOINTS_GAP
+
+    if fit(joints):
         return
-    worst = template.joint_names[int(np.flatnonzero(judged)[gaps.argmax()])]
+    names = [name for name, known in zip(template.joint_names, judged) if known]
+    gaps = np.linalg.norm(joints - borders, axis=1)
     problem = (
-        f"joints: expected each where the weights of its subtree end, {worst} lies {gaps.max():.2f} m from there and "
-        f"half of them lie {np.median(gaps):.2f} m or more."
+        f"joints: expected each where the weights of its subtree end, {names[gaps.argmax()]} lies {gaps.max():.2f} m "
+        f"from there and half of them lie {np.median(gaps):.2f} m or more."
     )
-    raise DataError(path, problem, _joint_hint(joints[judged], borders[judged], _names(template, judged), scale))
+    raise DataError(path, problem, _joint_hint(joints, borders, names, fit))
 
 
 def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Template, path: Path) -> None:
@@ -126,24 +132,15 @@ def _apart(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.quantile(np.linalg.norm(a - b, axis=1), SHARE))
 
 
-def _names(template: Template, judged: np.ndarray) -> list[str]:
-    """Names of the joints that are judged."""
-    return [name for name, known in zip(template.joint_names, judged) if known]
-
-
-def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], scale: float) -> str:
-    """What would lay joints ``(J, 3)`` on the borders of their weights ``(J, 3)``."""
-
-    def fits(places: np.ndarray) -> bool:
-        return float(np.median(np.linalg.norm(places - borders, axis=1))) <= JOINTS_GAP * scale
-
+def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: Callable[[np.ndarray], bool]) -> str:
+    """What would lay joints ``(J, 3)`` on the borders of their weights ``(J, 3)``, so that they ``fit``."""
     for factor, unit in ((100, "centimetres"), (1000, "millimetres")):
-        if fits(joints / factor):
+        if fit(joints / factor):
             return f"They look like {unit}: divide joints by {factor}."
     other = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in names]
-    if set(other) == set(names) and fits(joints[[names.index(name) for name in other]]):
+    if set(other) == set(names) and fit(joints[[names.index(name) for name in other]]):
         return "The weights of left and right look swapped: exchange their columns, or the joints' names."
     shift = np.median(borders - joints, axis=0)
-    if fits(joints + shift):
+    if fit(joints + shift):
         return f"Moving all joints by ({', '.join(f'{s:.2f}' for s in shift)}) m would lay them there."
     return "Are joints in the order of the weights' columns, at rest, in metres, in the vertices' coordinates?"

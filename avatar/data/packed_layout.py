@@ -150,7 +150,7 @@ class PackedOutfit(Outfit):
         if "pose" in stored:
             posed = self.fit_pose(stored["pose"], stored.get("translation"))
             if vertices is not None and "translation" not in stored:
-                posed = self.fit_pose(stored["pose"], (vertices - posed.vertices).mean(axis=0))
+                posed = self.fit_pose(stored["pose"], (vertices - posed.vertices).mean(axis=0, dtype=np.float64))
         joint_transforms = self._joint_transforms(stored, posed, path)
         if "vtransf" in stored:
             transforms = _whole_transforms(stored, path)

@@ -19,9 +19,11 @@ from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import outfit_folder
 from avatar.data.packed_layout import PackedOutfit, fit_joint_transforms, write_packed_frame, write_packed_outfit
 from avatar.data.scanner import ScanConfig
+from avatar.data.splits import split_outfit
 from avatar.geometry.transforms import transform_points
 from avatar.io.frames import check_manifest, read_open_frame, write_open_frame
 from avatar.io.npz import write_arrays
+from avatar.training.canonicalizing import CanonicalizeConfig
 
 FIT_KEYS = ("vertices", "vertex_transforms", "joint_transforms", "pose_vertices", "translation", "pose")
 SCAN_KEYS = ("points", "normals", "labels", "canonical")
@@ -192,6 +194,20 @@ def test_what_a_frame_lacks_is_derived(packed, kept):
     np.testing.assert_allclose(fit.pose_vertices, seen, atol=2e-4)
 
 
+@pytest.mark.parametrize("write", [write_body, lambda path, body: write_template(path, body.template)])
+def test_joint_transforms_of_a_body_bound_in_an_a_pose_follow_from_vtransf(tiny_outfit, tmp_path, write):
+    """Weights blend motions from the bind pose, not from rest: blended from rest, collars are 20 degrees off."""
+    known = tiny_outfit.load("train", "rise.00005")
+    write(tmp_path / "template.npz", tiny_outfit.body)
+    (tmp_path / "train").mkdir()
+    keys = {"vtransf": known.body.vertex_transforms, "body_verts": known.body.vertices}
+    np.savez(tmp_path / "train" / "a.npz", scan_pc=known.scan.points, scan_n=known.scan.normals, **keys)
+    found = PackedOutfit(tmp_path).load("train", "a").body
+    np.testing.assert_allclose(found.joint_transforms, known.body.joint_transforms, atol=2e-4)
+    posed = PackedOutfit(tmp_path).fit_pose(known.body.pose, known.body.translation)
+    np.testing.assert_allclose(posed.vertices, known.body.vertices, atol=2e-5)
+
+
 def test_joint_transforms_are_recovered_by_least_squares():
     rng = np.random.default_rng(0)
     weights = rng.dirichlet(np.full(5, 0.3), size=200).astype(np.float32)
@@ -357,6 +373,19 @@ def test_links_out_of_the_root_are_refused(tiny_folder, tmp_path):
     (tmp_path / "open" / "tiny").symlink_to(tiny_folder)
     with pytest.raises(DataError, match="it is a link to"):
         find_outfit(tmp_path, "open", "tiny")
+
+
+@pytest.mark.parametrize("emptied", [True, False])
+def test_data_without_test_frames_train_and_canonicalize(copy, emptied):
+    """A test folder may be missing, or there and empty."""
+    shutil.rmtree(copy / "test")
+    if emptied:
+        (copy / "test").mkdir()
+    outfit = OpenOutfit(copy)
+    assert (outfit.has_frames("train"), outfit.has_frames("test")) == (True, False)
+    assert len(split_outfit(outfit).train) == 5
+    config = CanonicalizeConfig(dataset="open", outfit="tiny", data_root=copy.parents[1])
+    assert {where.split for where in config.frames().names} == {"train"}
 
 
 def test_empty_splits_are_one_error(copy):

@@ -5,15 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from motion_files import MIXAMO, write_bvh
 from scipy.spatial.transform import Rotation, Slerp
 
-from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
+from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError, check_name
-from avatar.io.motions import read_motion, resample_motion, write_motion
+from avatar.io.motions import read_body_motion, read_motion, resample_motion, write_motion
 from avatar.io.npz import write_arrays
-from avatar.records import Motion
+from avatar.io.retargeting import move_body
+from avatar.records import Motion, Template
 from avatar.simulate.sequences import authored_motion
 
 
@@ -235,3 +237,65 @@ def test_bad_requests_are_refused(tmp_path, walk):
     ):
         with pytest.raises(AvatarError, match=message):
             call()
+
+
+def other_body(names, order):
+    """The open body with its joints called and ordered otherwise; parents come first still."""
+    bind = open_body("female")
+    parents = [-1 if SMPL_PARENTS[j] < 0 else order.index(SMPL_PARENTS[j]) for j in order]
+    template = replace(
+        bind.template,
+        vertices=bind.bind_vertices,
+        weights=bind.weights[:, order],
+        joints=bind.bind_joints[order],
+        parents=tuple(parents),
+        joint_names=tuple(names[SMPL_JOINTS[j]] for j in order),
+        canonical_from_bind=None,
+    )
+    return BodyModel(template, bind.zero_from_bind[order])
+
+
+@pytest.mark.parametrize("names", [{j: f"mixamorig:{MIXAMO[j]}" for j in SMPL_JOINTS}, {j: j for j in SMPL_JOINTS}])
+def test_bodies_with_joints_of_other_names_and_order_move_alike(tmp_path, walk, names):
+    depth_first = [0, 1, 4, 7, 10, 2, 5, 8, 11, 3, 6, 9, 12, 15, 13, 16, 18, 20, 14, 17, 19, 21]
+    body, motion = other_body(names, depth_first), replace(walk, poses=walk.poses[::15])
+    write_motion(tmp_path / "a.npz", replace(motion, translations=walk.translations[::15]))
+    read = read_body_motion(tmp_path / "a.npz", body)
+    moved = body(torch.from_numpy(read.poses), torch.from_numpy(read.translations)).vertices
+    expected = open_body("female")(torch.from_numpy(motion.poses), torch.from_numpy(read.translations)).vertices
+    torch.testing.assert_close(moved, expected, atol=1e-4, rtol=0)
+    strange = other_body({joint: f"bone{i}" for i, joint in enumerate(SMPL_JOINTS)}, depth_first)
+    with pytest.raises(AvatarError, match="found none for left_hip"):
+        read_body_motion(tmp_path / "a.npz", strange)
+
+
+def test_joints_a_body_has_beyond_ours_stay_at_rest(walk):
+    """Its collar is missing as well: the shoulder takes the collar's turn with its own."""
+    kept = [joint for joint in range(22) if SMPL_JOINTS[joint] != "left_collar"]
+    parents = [-1, *(kept.index(p if p in kept else SMPL_PARENTS[p]) for p in (SMPL_PARENTS[j] for j in kept[1:]))]
+    names = [SMPL_JOINTS[joint] for joint in kept]
+    places = open_body("female").template.joints[kept]
+    joints = torch.cat([places, places[-1:] + 0.1])
+    weights = torch.nn.functional.one_hot(torch.arange(22), 22).float()
+    bind = Template(joints, torch.tensor([[0, 1, 2]]), weights, joints, (*parents, 20), (*names, "right_thumb"))
+    moved = move_body(walk, BodyModel(bind))
+    assert moved.poses.shape == (len(walk.poses), 22, 3) and not moved.poses[:, 21].any()
+    collar, shoulder = (walk.poses[:, SMPL_JOINTS.index(f"left_{joint}")] for joint in ("collar", "shoulder"))
+    both = Rotation.from_rotvec(collar) * Rotation.from_rotvec(shoulder)
+    assert_same_poses(both.as_rotvec(), moved.poses[:, names.index("left_shoulder")])
+
+
+def test_bvh_on_smpl_s_own_names_takes_ankles_for_ankles(tmp_path, walk):
+    """``left_foot`` and ``left_shoulder`` are other joints to Mixamo."""
+    names = {joint: joint for joint in SMPL_JOINTS}
+    read = read_motion(write_bvh(tmp_path / "a.bvh", walk, names=names, prefix=""))
+    assert_same_poses(read.poses, walk.poses)
+
+
+def test_bvh_is_fitted_to_the_body_that_moves(tmp_path, walk):
+    """Another size and another origin: its pelvis goes where the skeleton's goes, in proportion to the legs."""
+    rest = open_body("mean").template.joints.double().numpy()
+    path = write_bvh(tmp_path / "a.bvh", walk)
+    read = read_motion(path, rest=1.5 * rest + [0, 0.4, 0])
+    pelvis = 1.5 * (walk.translations + rest[0])
+    np.testing.assert_allclose(read.translations + 1.5 * rest[0] + [0, 0.4, 0], pelvis, atol=1e-5)
