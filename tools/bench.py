@@ -1,4 +1,4 @@
-"""Says how fast it is: python tools/bench.py only=[chamfer,step] repeats=5"""
+"""Says how fast it is: python tools/bench.py 'only=[chamfer,step]' repeats=5"""
 
 from start import run
 

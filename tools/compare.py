@@ -1,4 +1,4 @@
-"""Makes one table of many runs' scores: python tools/compare.py dataset=sample methods=[static,closet]"""
+"""Makes one table of many runs' scores: python tools/compare.py dataset=sample 'methods=[static,closet]'"""
 
 from start import run
 

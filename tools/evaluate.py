@@ -1,4 +1,4 @@
-"""Scores predictions beside their floors: python tools/evaluate.py runs=[<run folder>]"""
+"""Scores predictions beside their floors: python tools/evaluate.py 'runs=[<run folder>]'"""
 
 from start import run
 

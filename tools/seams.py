@@ -1,4 +1,4 @@
-"""Measures predictions at the seams of the UV atlas: python tools/seams.py runs=[<run of pop>,<run of closet>]"""
+"""Measures predictions at the seams of the UV atlas: python tools/seams.py 'runs=[<run of pop>,<run of closet>]'"""
 
 from start import run
 

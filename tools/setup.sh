@@ -38,3 +38,4 @@ if [ ! -f "$stamp" ] || [ setup.cfg -nt "$stamp" ] || [ constraints.txt -nt "$st
     .venv/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[$extras]"
     touch "$stamp"
 fi
+echo "setup: done. In every new shell run: . .venv/bin/activate"

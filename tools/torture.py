@@ -1,4 +1,4 @@
-"""Kills, corrupts, poisons and races the program and counts what it lost: python tools/torture.py only=[kill,flips]"""
+"""Kills, corrupts, poisons and races the program, and counts losses: python tools/torture.py 'only=[kill,flips]'"""
 
 from start import run
 
