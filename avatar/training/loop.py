@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from avatar.nn.methods import draw_samples
 from avatar.records import Batch, LossTerms, SurfaceSamples
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.training.distributed import average, current_team, from_lead, gather, gradients_of, share_norms
+from avatar.training.feeding import Feed
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
 from avatar.training.losses import TERMS, LossConfig, point_avatar_loss
@@ -141,9 +143,10 @@ class Trainer:
         """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
         started, config = time.monotonic() - self.seconds, self.config
         off = None if log else True  # None: only where somebody watches
-        with tqdm(total=config.steps, initial=self.step, desc="train", unit="step", disable=off) as bar:
+        feed = Feed(lambda step: (batch_at(step), self.samples_at(step)), config.steps, self.device)
+        with feed, tqdm(total=config.steps, initial=self.step, desc="train", unit="step", disable=off) as bar:
             while self.progress() < 1:
-                terms, rate, norm = self.train_step(batch_at(self.step))
+                terms, rate, norm = self.train_step(*feed(self.step))
                 self.step += 1
                 stopping = self.tell_time(time.monotonic() - started, stop)
                 bar.update()
@@ -186,13 +189,21 @@ class Trainer:
         return max(self.step / self.config.steps, clock)
 
     def samples_at(self, step: int) -> SurfaceSamples:
-        """The template points of a step: one fixed set, or a fresh one every step."""
-        seed = self.config.seed * 1_000_003 + (step + 1 if self.config.fresh_points else 0)
-        generator = torch.Generator().manual_seed(seed)
-        return draw_samples(self.model, *self.surface, self.config.points, generator).to(self.device)
+        """The template points of a step: one fixed set, or a fresh one every step; those of step -1 are the fixed."""
+        return self.draw_points(step + 1) if self.config.fresh_points and step >= 0 else self.fixed_points
 
-    def train_step(self, batch: Batch) -> tuple[LossTerms, float, Tensor]:
-        """One optimiser step; gives the loss terms, the learning rate and the gradient norm.
+    @cached_property
+    def fixed_points(self) -> SurfaceSamples:
+        """The template points that stay the same, on the device."""
+        return self.draw_points(0).to(self.device)
+
+    def draw_points(self, key: int) -> SurfaceSamples:
+        """The template points that a key draws."""
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + key)
+        return draw_samples(self.model, *self.surface, self.config.points, generator)
+
+    def train_step(self, batch: Batch, samples: SurfaceSamples) -> tuple[LossTerms, float, Tensor]:
+        """One optimiser step on inputs that are on the device; gives loss terms, learning rate and gradient norm.
 
         A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were.
         """
@@ -201,7 +212,7 @@ class Trainer:
         for group, base in zip(self.optimiser.param_groups, self.base_rates):
             group["lr"] = base * factor
         before = [statistic.clone() for statistic in self.statistics]
-        terms = self.losses(batch.to(self.device), self.samples_at(self.step), self.progress())
+        terms = self.losses(batch, samples, self.progress())
         self.optimiser.zero_grad(set_to_none=True)
         terms.total.backward()
         total = terms.total.detach().clone()
@@ -227,8 +238,8 @@ class Trainer:
         narrow = self.config.precision is Precision.bf16
         with torch.autocast(self.device.type, torch.bfloat16) if narrow else nullcontext():
             prediction = self.model(batch, samples)
-        if not prediction.points.is_cuda and not torch.isfinite(prediction.points).all():
-            undefined = prediction.points.sum() * math.nan  # as on CUDA, where neighbours of NaN are not refused
+        if prediction.points.device.type == "cpu" and not torch.isfinite(prediction.points).all():
+            undefined = prediction.points.sum() * math.nan  # as on devices, where neighbours of NaN are not refused
             return LossTerms(dict.fromkeys(TERMS, undefined), {"points_to_scan": undefined})
         return point_avatar_loss(prediction, batch, self.config.loss, progress)
 
