@@ -11,8 +11,13 @@ import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+from avatar.checks import AvatarError
 from avatar.invocation import CORE, DISTRIBUTIONS, install_line
+
+if TYPE_CHECKING:
+    import torch
 
 # Idle OpenMP threads look for work for some microseconds and then sleep. Where processes share cores, threads that spin
 # without end make a training step many times slower; threads that sleep at once have to be woken for each of its many
@@ -90,11 +95,34 @@ def mending_line(package: str, message: str) -> str:
     return install_line(package)
 
 
+def accelerator_type() -> str:
+    """The kind of device that torch trains on where nothing else is asked for: CUDA where there is one."""
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of a name; ``auto`` is that of `accelerator_type`. All that is put on a device asks here.
+
+    Raises:
+        AvatarError: for a device that there is not.
+    """
+    import torch
+
+    name = accelerator_type() if name == "auto" else name
+    try:
+        return torch.zeros(0, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise AvatarError(f"device: expected auto, cpu or a CUDA device there is, got {name!r} ({reason}).") from error
+
+
 def accelerator() -> str:
     """What torch would train on, in words."""
     import torch
 
-    if torch.cuda.is_available():
+    if accelerator_type() == "cuda":
         return f"CUDA {torch.version.cuda}: {torch.cuda.get_device_name()}"
     return f"CPU with {torch.get_num_threads()} threads"
 

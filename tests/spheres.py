@@ -33,13 +33,13 @@ def small_config(**switches) -> ClosetConfig:
 
 
 def random_batch(frames: int = 3, outfits: tuple[int, ...] = (0, 1, 0)) -> Batch:
-    torch.manual_seed(1)
+    draw = torch.Generator().manual_seed(1)
     count = len(TEMPLATE.vertices)
     transforms = torch.eye(4).repeat(frames, count, 1, 1)
-    transforms[..., :3, :3] += 0.1 * torch.randn(frames, 1, 3, 3)
-    transforms[..., :3, 3] = torch.randn(frames, 1, 3)
+    transforms[..., :3, :3] += 0.1 * torch.randn(frames, 1, 3, 3, generator=draw)
+    transforms[..., :3, 3] = torch.randn(frames, 1, 3, generator=draw)
     vertices = (transforms[..., :3, :3] @ TEMPLATE.vertices[:, :, None])[..., 0] + transforms[..., :3, 3]
-    scans = torch.randn(frames, 50, 3)
+    scans = torch.randn(frames, 50, 3, generator=draw)
     return Batch(
         pose_vertices=vertices,
         vertices=vertices,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from avatar.canonical.canonicalizer import Cycle
 from avatar.canonical.posed import ScanBatch
 from avatar.checks import AvatarError
-from avatar.geometry.neighbours import nearest
+from avatar.geometry.neighbours import FixedPoints
 from avatar.records import LossTerms, Template
 
 TERMS = ("body", "nearest", "cycle_weights", "cycle_points", "sparsity", "smoothness", "latent")
@@ -36,8 +37,23 @@ class CanonicalLossConfig:
             raise AvatarError(f"loss: expected weights of at least 0 and beta in (0, 1], got {wrong or self.beta}.")
 
 
+class NearestWeights:
+    """The skinning weights of the canonical body's nearest vertex: what E_S compares weights in canonical space with.
+
+    The search structure over the body is built once.
+    """
+
+    def __init__(self, template: Template, device: torch.device | str = "cpu"):
+        """Takes the body at rest to a device."""
+        self.weights, self.vertices = template.weights.to(device), FixedPoints(template.vertices.to(device))
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Weights ``(B, N, J)`` at points ``(B, N, 3)`` of canonical space; without gradient."""
+        return self.weights[self.vertices.k_nearest(points.detach(), 1)[..., 0]]
+
+
 def canonicalization_loss(
-    cycle: Cycle, batch: ScanBatch, template: Template, config: CanonicalLossConfig, progress: float = 0.0
+    cycle: Cycle, batch: ScanBatch, nearest: NearestWeights, config: CanonicalLossConfig, progress: float = 0.0
 ) -> LossTerms:
     """The objective of either stage, reduced to means over frames and points.
 
@@ -47,7 +63,7 @@ def canonicalization_loss(
     Args:
         cycle: what the canonicalizer gave for the batch; its stage 2 terms are there where it came back.
         batch: the points.
-        template: the body at rest.
+        nearest: the body's weights in canonical space.
         config: weights.
         progress: share of stage 2 that is done, in [0, 1].
     """
@@ -55,7 +71,7 @@ def canonicalization_loss(
         "body": squared_distance(cycle.body_weights, batch.body_weights)
         + squared_distance(cycle.canonical_body_weights, batch.body_weights),
         "nearest": squared_distance(cycle.scan_weights, batch.nearest_weights)
-        + squared_distance(cycle.canonical_weights, nearest_weights(cycle.canonical, template)),
+        + squared_distance(cycle.canonical_weights, nearest(cycle.canonical)),
         "sparsity": cycle.scan_weights.clamp(min=SMALLEST_WEIGHT).pow(config.beta).sum(dim=-1).mean(),
     }
     if cycle.reposed is not None:
@@ -73,9 +89,3 @@ def canonicalization_loss(
 def squared_distance(ones: Tensor, others: Tensor) -> Tensor:
     """Mean squared Euclidean distance between rows of ``(..., C)``."""
     return (ones - others).square().sum(dim=-1).mean()
-
-
-def nearest_weights(points: Tensor, template: Template) -> Tensor:
-    """Weights ``(B, N, J)`` of the vertex of the canonical body nearest to each of ``(B, N, 3)`` points."""
-    ids = nearest(points.detach().reshape(1, -1, 3), template.vertices[None])
-    return template.weights[ids[0]].unflatten(0, points.shape[:2])

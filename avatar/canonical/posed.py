@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from avatar.canonical.fields import bounding_box
 from avatar.checks import AvatarError
 from avatar.geometry.surface import face_areas, interpolate, sample_surface
 from avatar.geometry.transforms import axis_angle_from_rotation, invert_affine, transform_points
-from avatar.records import BodyFit, Frame, Scan, Template
+from avatar.records import BodyFit, Frame, Scan, Template, map_tensors
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class ScanBatch:
 
     def to(self, device: torch.device | str) -> ScanBatch:
         """The same batch on another device."""
-        return ScanBatch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        return map_tensors(self, lambda tensor: tensor.to(device))
 
 
 @dataclass

@@ -1,11 +1,11 @@
-"""Exact nearest neighbours: KD-trees on the CPU, brute force on CUDA. Indices only; distances stay in torch."""
+"""Exact nearest neighbours: KD-trees on the CPU, brute force on devices. Indices only; distances stay in torch."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -14,7 +14,8 @@ from torch import Tensor
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.trees import Tree, build_tree
 
-CUDA_CHUNK_PAIRS = 1 << 27  # distances held at once by the chunked CUDA search: 512 MiB in float32
+CHUNK_PAIRS = 1 << 27  # distances held at once by the chunked search of devices: 512 MiB in float32
+WARNED: set[str] = set()  # kinds of errors of Triton that have been reported
 report = logging.getLogger(__name__)
 
 
@@ -30,7 +31,7 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
     Exact on every device: distances are sums of squared differences, never the expanded product form, which
     picks a wrong neighbour for near ties. Among points at the same distance any may come, the same each time.
 
-    Coordinates that are not finite are refused on the CPU. On CUDA looking for them would stall the stream, so
+    Coordinates that are not finite are refused on the CPU. On a device looking for them would stall the stream, so
     they pass through: the indices stay in range and the distances taken with them are NaN, for the loss to show.
 
     Args:
@@ -48,14 +49,10 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
     dims = check_shape("points", points, "B M 3", B=dims["B"])
     if not 1 <= k <= dims["M"]:
         raise AvatarError(f"k, points: expected k of at least 1 and k={k} points or more, got {dims['M']} points.")
-    if queries.is_cuda:
-        fused = fused_search() if k == 1 and torch.float64 not in (queries.dtype, points.dtype) else None
-        if fused:
-            return fused(queries.float(), points.float()).unsqueeze(-1)
-        return torch.stack([_k_nearest_chunked(q, p, k) for q, p in zip(queries, points)])
-    pairs = zip(queries.double().cpu().numpy(), points.double().cpu().numpy())
-    found = [_ask(build_tree(cloud), query, k) for query, cloud in pairs]
-    return torch.stack(found).to(queries.device)
+    if queries.device.type != "cpu":
+        return _k_nearest_on_device(queries, points, k)
+    pairs = zip(queries.double().numpy(), points.double().numpy())
+    return torch.stack([_ask(build_tree(cloud), query, k) for query, cloud in pairs])
 
 
 @torch.no_grad()
@@ -77,7 +74,7 @@ def nearest_both_ways(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
     """
     dims = check_shape("points", points, "B N 3")
     check_shape("others", others, "B M 3", B=dims["B"])
-    if points.is_cuda or not (points.shape[1] and others.shape[1]):
+    if points.device.type != "cpu" or not (points.shape[1] and others.shape[1]):
         return nearest(points, others), nearest(others, points)
     clouds = [cloud.double().numpy() for batch in (points, others) for cloud in batch]
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # scipy lets go of Python's lock
@@ -86,20 +83,78 @@ def nearest_both_ways(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(found[: len(points)]), torch.stack(found[len(points) :])
 
 
+class FixedPoints:
+    """Points ``(M, 3)`` that stay the same, to be searched many times: their tree is built once, at the first search.
+
+    For what `k_nearest` would build anew at each call, such as the vertices of a body at rest.
+    """
+
+    def __init__(self, points: Tensor):
+        check_shape("points", points, "M 3")
+        self.points = points.detach()
+
+    @cached_property
+    def _tree(self) -> Tree:
+        return build_tree(self.points.double().cpu().numpy())
+
+    @torch.no_grad()
+    def k_nearest(self, queries: Tensor, k: int) -> Tensor:
+        """Indices ``(..., k)`` int64 of the k nearest points to queries ``(..., 3)`` on any device, nearest first.
+
+        Raises:
+            AvatarError: as `avatar.geometry.neighbours.k_nearest`.
+        """
+        check_shape("queries", queries, "... 3")
+        if not 1 <= k <= len(self.points):
+            raise AvatarError(f"k, points: expected k of 1 to the {len(self.points)} points, got {k}.")
+        flat = queries.reshape(-1, 3)
+        if queries.device.type == "cpu":
+            found = _ask(self._tree, flat.double().numpy(), k)
+        else:
+            self.points = self.points.to(queries.device)
+            found = _k_nearest_on_device(flat[None], self.points[None], k)[0]
+        return found.unflatten(0, queries.shape[:-1])
+
+
+def _k_nearest_on_device(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """`k_nearest` away from the CPU: in one pass where Triton can, else by brute force."""
+    if k == 1 and queries.is_cuda and torch.float64 not in (queries.dtype, points.dtype):
+        found = try_fused(queries.float(), points.float())
+        if found is not None:
+            return found.unsqueeze(-1)
+    return torch.stack([_k_nearest_chunked(q, p, k) for q, p in zip(queries, points)])
+
+
+def try_fused(queries: Tensor, points: Tensor) -> Tensor | None:
+    """`kernels.nearest_fused`; None, with one warning for each kind of error, where Triton fails.
+
+    CUDA builds of torch bring Triton along, but it needs a C compiler, too. What fails once, for want of memory or on
+    a busy file system, is tried again at the next call; only where there is no Triton at all nothing is tried.
+    """
+    search = fused_search()
+    try:
+        return search and search(queries, points)
+    except Exception as error:  # whatever a compiler or a driver says: it is only slower without
+        warn_slow(type(error).__name__, str(error))
+        return None
+
+
 @cache
 def fused_search() -> Callable[[Tensor, Tensor], Tensor] | None:
-    """`kernels.nearest_fused`, tried once on the current device; None, with a warning, where Triton cannot run it.
-
-    CUDA builds of torch bring Triton along, but it needs a C compiler, too.
-    """
+    """`kernels.nearest_fused`; None, with a warning, where there is no Triton."""
     try:
         from avatar.geometry.kernels import nearest_fused
-
-        nearest_fused(torch.zeros(1, 1, 3, device="cuda"), torch.zeros(1, 1, 3, device="cuda"))
-    except Exception as error:  # whatever a compiler says: it is only slower without
-        report.warning("Nearest neighbours on CUDA go the slow way, for Triton does not work here: %s", error)
+    except ImportError as error:
+        warn_slow(type(error).__name__, str(error))
         return None
     return nearest_fused
+
+
+def warn_slow(kind: str, reason: str) -> None:
+    """Warns that a search goes by brute force: once for each kind of error."""
+    if kind not in WARNED:
+        WARNED.add(kind)
+        report.warning("Nearest neighbours on CUDA go the slow way, for Triton failed (%s: %s).", kind, reason)
 
 
 def _ask(tree: Tree, queries: np.ndarray, k: int) -> Tensor:
@@ -120,7 +175,7 @@ def _ask_in_order(tree: Tree, other: Tree) -> Tensor:
 
 def _k_nearest_chunked(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Brute force over chunks of queries for one cloud, with squares of differences (exact)."""
-    chunk = max(1, CUDA_CHUNK_PAIRS // len(points))
+    chunk = max(1, CHUNK_PAIRS // len(points))
     found = []
     for part in queries.split(chunk):
         squared = (part[:, None, 0] - points[None, :, 0]).square_()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.neighbours import k_nearest
+from avatar.geometry.neighbours import FixedPoints
 from avatar.records import Template
 
 
@@ -23,12 +23,13 @@ class BodyField(nn.Module):
             raise AvatarError(f"neighbours: expected 1 to {len(template.vertices)}, got {neighbours}.")
         self.neighbours = neighbours
         self.register_buffer("vertices", template.vertices.clone(), persistent=False)
+        self.search = FixedPoints(self.vertices)
         self.register_buffer("weights", template.weights.clone(), persistent=False)
 
     def forward(self, points: Tensor) -> Tensor:
         """Weights ``(B, N, J)``, rows summing to 1, of canonical points ``(B, N, 3)``."""
         check_shape("points", points, "B N 3")
-        ids = k_nearest(points.detach(), self.vertices.expand(len(points), -1, -1), self.neighbours)
+        ids = self.search.k_nearest(points.detach(), self.neighbours)
         squares = (points.unsqueeze(2) - self.vertices[ids]).square().sum(dim=-1)
         closeness = squares.clamp(min=1e-12).rsqrt()
         closeness = closeness / closeness.sum(dim=-1, keepdim=True)

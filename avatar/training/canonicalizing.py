@@ -27,6 +27,7 @@ from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.soundness import check_frame_count
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.data.streaming import Streamed
+from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
 from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.ledger import Ledger, digest_of
@@ -39,7 +40,7 @@ from avatar.training.building import building
 from avatar.training.checkpoints import read_weights, write_weights
 from avatar.training.cycles import CycleConfig, CycleTrainer, find_code
 from avatar.training.distributed import refuse_team
-from avatar.training.runs import choose_device, save_settings
+from avatar.training.runs import save_settings
 
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
 CHUNK = 20_000  # points asked about at once, or fewer where memory runs out
@@ -129,7 +130,7 @@ class TrainedCanonicalizer:
             return codes[self.frames.index(frame.name)]
         scan = prepare_scan(frame, self.template, self.config.train.draw.pool)
         alike = (self.poses - scan.joint_transforms).square().sum(dim=(1, 2, 3)).argmin()
-        return find_code(self.model, self.template.to(codes.device), scan, codes[alike], self.config.train)
+        return find_code(self.model, self.template, scan, codes[alike], self.config.train)
 
     def weights_of(self, points: np.ndarray, frame: Frame) -> np.ndarray:
         """Weights ``(M, J)`` of posed points ``(M, 3)`` in the frame's world, metres (see `SkinningSource`)."""

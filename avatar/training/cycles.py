@@ -13,12 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from avatar.canonical.canonicalizer import Canonicalizer, Latent
-from avatar.canonical.losses import TERMS, CanonicalLossConfig, canonicalization_loss
+from avatar.canonical.losses import TERMS, CanonicalLossConfig, NearestWeights, canonicalization_loss
 from avatar.canonical.posed import DrawConfig, PosedScan, ScanBatch, draw_batch
 from avatar.checks import AvatarError
 from avatar.progress import Progress
 from avatar.records import LossTerms, Template
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
+from avatar.training.feeding import Feed
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
 from avatar.training.signals import StopRequest, stop_requests
@@ -77,7 +78,8 @@ class CycleTrainer:
     ):
         """Prepares training of a canonicalizer on its scans; ``names`` are theirs, for messages."""
         self.device = next(model.parameters()).device
-        self.model, self.template, self.config, self.folder = model, template.to(self.device), config, folder
+        self.model, self.config, self.folder = model, config, folder
+        self.nearest = NearestWeights(template, self.device)
         self.scans, self.names, self.weights = scans, names, template.weights
         self.optimiser = torch.optim.Adam(model.parameters(), lr=config.first_lr, fused=True)
         self.step, self.seconds, self.bad_steps = 0, 0.0, 0
@@ -100,9 +102,10 @@ class CycleTrainer:
     def run(self, log: TrainingLog, stop: StopRequest) -> None:
         """The steps from here to the end, with what is logged and saved between them."""
         started, config = time.monotonic() - self.seconds, self.config
-        with Progress("canonicalizer", config.steps, "step", self.step, spent=self.seconds) as bar:
+        bar = Progress("canonicalizer", config.steps, "step", self.step, spent=self.seconds)
+        with bar, Feed(lambda step: (self.batch_at(step),), config.steps, self.device) as feed:
             while self.step < config.steps:
-                terms, norm = self.train_step()
+                terms, norm = self.train_step(*feed(self.step))
                 self.step, self.seconds = self.step + 1, time.monotonic() - started
                 bar.advance()
                 done, stopping = self.step == config.steps, stop.number is not None
@@ -127,7 +130,7 @@ class CycleTrainer:
         places = torch.arange(step * self.config.batch, (step + 1) * self.config.batch)
         frames = [self.frame_at(int(place)) for place in places]
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + step)
-        return draw_batch(self.scans, frames, self.weights, self.config.draw, generator).to(self.device)
+        return draw_batch(self.scans, frames, self.weights, self.config.draw, generator)
 
     def frame_at(self, place: int) -> int:
         """The scan at a place in the endless row of epochs, each of which is a permutation of them all."""
@@ -135,8 +138,8 @@ class CycleTrainer:
         generator = torch.Generator().manual_seed((self.config.seed + 1) * SEED_STRIDE + epoch)
         return int(torch.randperm(len(self.scans), generator=generator)[offset])
 
-    def train_step(self) -> tuple[LossTerms, float]:
-        """One optimiser step; gives the loss terms and the gradient norm."""
+    def train_step(self, batch: ScanBatch) -> tuple[LossTerms, float]:
+        """One optimiser step on a batch that is on the device; gives the loss terms and the gradient norm."""
         stage = self.step - self.config.first_steps
         if stage == 0:
             self.optimiser.state.clear()  # the stages have an optimiser each
@@ -147,10 +150,9 @@ class CycleTrainer:
         )
         progress = (stage if stage >= 0 else self.step) / steps
         self.optimiser.param_groups[0]["lr"] = rate * rate_factor(progress, self.config.decay)
-        batch = self.batch_at(self.step)
         codes = self.model.batch_codes(batch)
         cycle = self.model(batch, codes, together=stage >= 0)
-        terms = canonicalization_loss(cycle, batch, self.template, self.config.loss, progress if stage >= 0 else 0.0)
+        terms = canonicalization_loss(cycle, batch, self.nearest, self.config.loss, progress if stage >= 0 else 0.0)
         self.optimiser.zero_grad(set_to_none=True)
         terms.total.backward()
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip or math.inf)
@@ -200,7 +202,7 @@ def find_code(model: Canonicalizer, template: Template, scan: PosedScan, start: 
 
     Args:
         model: a trained canonicalizer with codes.
-        template: the body at rest, on the model's device.
+        template: the body at rest.
         scan: the frame.
         start: ``(L,)`` where to begin: the code of a learned frame in a similar pose.
         config: steps, rate, points and loss weights.
@@ -208,13 +210,14 @@ def find_code(model: Canonicalizer, template: Template, scan: PosedScan, start: 
     if model.config.latent is Latent.pose:
         return scan.pose.to(start)
     code = start.detach().clone().requires_grad_()
+    nearest, weights = NearestWeights(template, code.device), template.weights.cpu()
     optimiser = torch.optim.Adam([code], lr=config.code_lr)
     for step in range(config.code_steps):
         optimiser.param_groups[0]["lr"] = config.code_lr * rate_factor(step / config.code_steps, config.decay)
         generator = torch.Generator().manual_seed(config.seed * SEED_STRIDE + step)
-        batch = draw_batch([scan], [0], template.weights.cpu(), config.draw, generator).to(code.device)
+        batch = draw_batch([scan], [0], weights, config.draw, generator).to(code.device)
         cycle = model(batch, code[None], together=True)
-        loss = canonicalization_loss(cycle, batch, template, config.loss, step / config.code_steps).total
+        loss = canonicalization_loss(cycle, batch, nearest, config.loss, step / config.code_steps).total
         (code.grad,) = torch.autograd.grad(loss, [code])
         optimiser.step()
     return code.detach()

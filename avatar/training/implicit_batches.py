@@ -15,7 +15,7 @@ from avatar.data.batches import draw_points
 from avatar.data.mirroring import ACROSS, MirrorMap, mirror_coins
 from avatar.data.scanner import frame_seed
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.records import Frame
+from avatar.records import Frame, map_tensors
 
 POOL = 40_000  # points a scan that is a mesh is turned into, once; every step draws from them
 
@@ -60,8 +60,7 @@ class CanonicalBatch:
 
     def to(self, device: torch.device | str) -> CanonicalBatch:
         """The same batch on another device."""
-        moved = {name: getattr(self, name).to(device) for name in ("points", "normals", "joint_transforms")}
-        return replace(self, **moved, colors=None if self.colors is None else self.colors.to(device))
+        return map_tensors(self, lambda tensor: tensor.to(device))
 
 
 class CanonicalFrames:

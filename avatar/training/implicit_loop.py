@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from torch import Tensor, nn
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar
 from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
-from avatar.implicit.probing import ProbeConfig, probe_field, space_points
+from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
 from avatar.progress import Progress
 from avatar.records import LossTerms
 from avatar.training.checkpoints import load_checkpoint, restoring, save_checkpoint
+from avatar.training.feeding import Feed, to_device
 from avatar.training.implicit_batches import CanonicalBatch, CanonicalFrames
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
@@ -67,7 +69,7 @@ class ImplicitTrainer:
         """
         self.model, self.config, self.settings, self.folder = model, config, settings, folder
         self.device = model.box.device
-        self.body = body.to(self.device)
+        self.body, self.box = body, model.box.cpu()
         self.learned = [parameter for parameter in model.parameters() if parameter.requires_grad]
         self.optimiser = torch.optim.Adam(self.learned, lr=config.lr, fused=True)
         self.step, self.seconds, self.bad_steps = 0, 0.0, 0
@@ -79,14 +81,15 @@ class ImplicitTrainer:
             AvatarError: when losses or gradients stay non-finite.
             Stopped: when asked to stop (`signals`); the state is saved.
         """
-        with lock_folder(self.folder), stop_requests() as stop:
+        feed = Feed(partial(self.inputs_at, frames), self.config.steps, self.device)
+        with lock_folder(self.folder), stop_requests() as stop, feed:
             self.resume()
             log = TrainingLog(self.folder, ["loss", *TERMS, "lr", "grad_norm"], self.step)
             started = time.monotonic() - self.seconds
             budget = 60 * self.config.minutes if self.config.minutes else None
             bar = Progress("train", self.config.steps, "step", self.step, budget, self.seconds)
             while self.progress() < 1 and stop.number is None:
-                terms, norm = self.train_step(frames.batch_at(self.step, self.config.batch))
+                terms, norm = self.train_step(*feed(self.step))
                 self.step, self.seconds = self.step + 1, time.monotonic() - started
                 bar.advance()
                 epoch = self.step * self.config.batch // len(frames)
@@ -116,10 +119,20 @@ class ImplicitTrainer:
         """Whether this step is one of every so many, or the last."""
         return self.step % every == 0 or self.progress() >= 1
 
-    def train_step(self, batch: CanonicalBatch) -> tuple[LossTerms, float]:
-        """One optimiser step; gives the loss terms and the gradient norm."""
+    def inputs_at(self, frames: CanonicalFrames, step: int) -> tuple[CanonicalBatch, SpacePoints]:
+        """The batch of a step and its points in space; both depend on nothing but the step and the seed."""
+        batch = frames.batch_at(step, self.config.batch)
+        return batch, self.space_at(batch, step)
+
+    def space_at(self, batch: CanonicalBatch, key: int) -> SpacePoints:
+        """The points in space that a key draws for a batch of the CPU."""
+        generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key + 1)
+        return space_points(batch.points, self.body, self.box, self.settings.probes, generator)
+
+    def train_step(self, batch: CanonicalBatch, space: SpacePoints) -> tuple[LossTerms, float]:
+        """One optimiser step on inputs that are on the device; gives the loss terms and the gradient norm."""
         self.optimiser.param_groups[0]["lr"] = self.config.lr * self.rate_factor()
-        terms = self.losses(batch.to(self.device), self.step)
+        terms = self.losses(batch, space)
         self.optimiser.zero_grad(set_to_none=True)
         terms.total.backward()
         norm = nn.utils.clip_grad_norm_(self.learned, self.config.clip or math.inf)
@@ -144,17 +157,16 @@ class ImplicitTrainer:
             factor *= 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
         return factor
 
-    def losses(self, batch: CanonicalBatch, key: int) -> LossTerms:
-        """The field asked at a batch's points and at points in space that the key draws, and the losses of it."""
-        generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key + 1)
-        space = space_points(batch.points, self.body, self.model.box, self.settings.probes, generator)
+    def losses(self, batch: CanonicalBatch, space: SpacePoints) -> LossTerms:
+        """The field asked at a batch's points and at points in space, and the losses of it."""
         values = probe_field(self.model, batch.points, space, batch.joint_transforms)
         return implicit_loss(values, batch.normals, self.settings.loss, batch.colors)
 
     @torch.no_grad()
     def validate(self, batches: Iterable[CanonicalBatch]) -> dict[str, float]:
         """Mean loss terms over held-back frames, always at the same points."""
-        rows = [log_values(self.losses(batch.to(self.device), -1)) for batch in batches]
+        inputs = (to_device((batch, self.space_at(batch, -1)), self.device) for batch in batches)
+        rows = [log_values(self.losses(*each)) for each in inputs]
         return {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
     def state(self) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from avatar.data.mirroring import mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.data.streaming import Streamed
+from avatar.environment import choose_device
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig
 from avatar.implicit.body_field import BodyField
 from avatar.io.documents import read_yaml
@@ -29,14 +30,7 @@ from avatar.training.checkpoints import read_weights, write_weights
 from avatar.training.distributed import refuse_team
 from avatar.training.implicit_batches import CanonicalFrame, CanonicalFrames, canonical_frame
 from avatar.training.implicit_loop import ImplicitTrainConfig, ImplicitTrainer
-from avatar.training.runs import (
-    WEIGHTS,
-    RunConfig,
-    TrainedAvatar,
-    choose_device,
-    choose_weights,
-    save_settings,
-)
+from avatar.training.runs import WEIGHTS, RunConfig, TrainedAvatar, choose_weights, save_settings
 
 METHOD = "scanimate"  # its name in RunConfig.method
 FIELD = "field."  # how the forward field's weights are named in the avatar's
@@ -117,7 +111,7 @@ def find_field(folder: Path, template: Template) -> nn.Module:
     if not path.is_file():
         raise DataError(path, "no such file.", "Run tools/canonicalize.py to its end.")
     if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is Skinning.learned:
-        return load_canonicalizer(folder).forward_field
+        return load_canonicalizer(folder, "cpu").forward_field
     return BodyField(template)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from avatar.training.distributed import (
     share_norms,
     step_outfits,
 )
+from avatar.training.feeding import Feed
 from avatar.training.locks import lock_folder
 from avatar.training.logs import TrainingLog
 from avatar.training.losses import TERMS, LossConfig, point_avatar_loss
@@ -149,9 +151,11 @@ class Trainer:
         """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
         started, config = time.monotonic() - self.seconds, self.config
         budget = 60 * config.minutes if config.minutes else None
-        with Progress("train", config.steps, "step", self.step, budget, self.seconds, silent=log is None) as bar:
+        feed = Feed(lambda step: (batch_at(step), self.samples_at(step)), config.steps, self.device)
+        bar = Progress("train", config.steps, "step", self.step, budget, self.seconds, silent=log is None)
+        with feed, bar:
             while self.progress() < 1:
-                terms, rate, norm = self.train_step(batch_at(self.step))
+                terms, rate, norm = self.train_step(*feed(self.step))
                 self.step += 1
                 stopping = self.tell_time(time.monotonic() - started, stop)
                 bar.advance()
@@ -194,13 +198,21 @@ class Trainer:
         return max(self.step / self.config.steps, clock)
 
     def samples_at(self, step: int) -> SurfaceSamples:
-        """The template points of a step: one fixed set, or a fresh one every step."""
-        seed = self.config.seed * 1_000_003 + (step + 1 if self.config.fresh_points else 0)
-        generator = torch.Generator().manual_seed(seed)
-        return draw_samples(self.model, *self.surface, self.config.points, generator).to(self.device)
+        """The template points of a step: one fixed set, or a fresh one every step; those of step -1 are the fixed."""
+        return self.draw_points(step + 1) if self.config.fresh_points and step >= 0 else self.fixed_points
 
-    def train_step(self, batch: Batch) -> tuple[LossTerms, float, Tensor]:
-        """One optimiser step; gives the loss terms, the learning rate and the gradient norm.
+    @cached_property
+    def fixed_points(self) -> SurfaceSamples:
+        """The template points that stay the same, on the device."""
+        return self.draw_points(0).to(self.device)
+
+    def draw_points(self, key: int) -> SurfaceSamples:
+        """The template points that a key draws."""
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + key)
+        return draw_samples(self.model, *self.surface, self.config.points, generator)
+
+    def train_step(self, batch: Batch, samples: SurfaceSamples) -> tuple[LossTerms, float, Tensor]:
+        """One optimiser step on inputs that are on the device; gives loss terms, learning rate and gradient norm.
 
         A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were.
         """
@@ -211,7 +223,7 @@ class Trainer:
         before = [statistic.clone() for statistic in self.statistics]
         if self.team.size > 1 and hasattr(self.model, "codes"):
             batch = replace(batch, step_outfits=step_outfits(batch.outfit_ids, len(self.model.codes), self.team))
-        terms = self.losses(batch.to(self.device), self.samples_at(self.step), self.progress())
+        terms = self.losses(batch, samples, self.progress())
         self.optimiser.zero_grad(set_to_none=True)
         terms.total.backward()
         total = terms.total.detach().clone()
@@ -237,9 +249,9 @@ class Trainer:
         narrow = self.config.precision is Precision.bf16
         with torch.autocast(self.device.type, torch.bfloat16) if narrow else nullcontext():
             prediction = self.model(batch, samples)
-        if prediction.points.is_cuda or torch.isfinite(prediction.points).all():
+        if prediction.points.device.type != "cpu" or torch.isfinite(prediction.points).all():
             return point_avatar_loss(prediction, batch, self.config.loss, progress)
-        # as on CUDA, where neighbours of NaN are not refused; by the same graph as in all processes, which wait for it
+        # as on devices, where neighbours of NaN are not refused; by the graph of all processes, which wait for it
         defined = replace(prediction, points=prediction.points.nan_to_num(0.0, 0.0, 0.0))
         terms = point_avatar_loss(defined, batch, self.config.loss, progress)
         parts = (terms.raw, terms.weighted)

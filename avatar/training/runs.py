@@ -21,6 +21,7 @@ from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
+from avatar.environment import choose_device
 from avatar.io.documents import read_yaml
 from avatar.io.npz import write_whole
 from avatar.nn.closet import Skinning
@@ -109,17 +110,6 @@ class TrainedAvatar:
     config: RunConfig
     steps: int
     seconds: float
-
-
-def choose_device(name: str) -> torch.device:
-    """The device to train on; ``auto`` takes CUDA where there is one."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        return torch.zeros(0, device=name).device
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise AvatarError(f"device: expected auto, cpu or a CUDA device there is, got {name!r} ({reason}).") from error
 
 
 def train_run(config: RunConfig) -> Path:

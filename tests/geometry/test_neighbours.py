@@ -38,8 +38,8 @@ def test_both_ways_agree_with_loop(points, others, seed):
         np.testing.assert_array_equal(back[b, :, None].numpy(), nearest_loop(second, first, 1))
 
 
-def test_chunked_search_of_cuda_agrees_with_the_tree(monkeypatch):
-    monkeypatch.setattr("avatar.geometry.neighbours.CUDA_CHUNK_PAIRS", 1000)  # several chunks, the last one short
+def test_chunked_search_of_devices_agrees_with_the_tree(monkeypatch):
+    monkeypatch.setattr("avatar.geometry.neighbours.CHUNK_PAIRS", 1000)  # several chunks, the last one short
     q, p = cloud(1, 333, 0), cloud(1, 200, 1)
     for k in (1, 5):
         torch.testing.assert_close(_k_nearest_chunked(q[0], p[0], k), k_nearest(q, p, k)[0])

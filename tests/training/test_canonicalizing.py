@@ -85,7 +85,7 @@ def test_each_stage_has_an_optimiser_of_its_own(tmp_path):
     trainer = make_trainer(tmp_path)
     counts = []
     for trainer.step in range(8):
-        trainer.train_step()
+        trainer.train_step(trainer.batch_at(trainer.step))
         counts.append(int(trainer.optimiser.state[trainer.model.codes]["step"]))
     assert counts == [1, 2, 3, 4, 5, 6, 1, 2]
 
@@ -176,7 +176,7 @@ def test_non_finite_losses_leave_the_weights_alone_and_end_training(tmp_path):
     trainer.optimiser.state.clear()
     with pytest.raises(AvatarError, match=r"not finite for 11 steps.*bend\.0000"):
         for _ in range(20):
-            trainer.train_step()
+            trainer.train_step(trainer.batch_at(trainer.step))
     assert all(torch.equal(value, before[name]) for name, value in trainer.model.named_parameters())
 
 

@@ -59,13 +59,17 @@ def test_a_signal_saves_and_the_run_goes_on_as_if_nothing_had_been(tmp_path, num
     options = {"steps": 6, "save_every": 100, "validate_every": 3}
     whole = fit(make_trainer(tmp_path / "whole", **options))
 
-    def signalled(step: int):
-        if step == 3:
-            os.kill(os.getpid(), number)
-        return random_batch()
+    trainer = make_trainer(tmp_path / "parts", **options)
+    take_step = trainer.train_step
 
+    def signalled(*inputs):
+        if trainer.step == 3:
+            os.kill(os.getpid(), number)
+        return take_step(*inputs)
+
+    trainer.train_step = signalled
     with pytest.raises(Stopped, match="The same command goes on"):
-        fit(make_trainer(tmp_path / "parts", **options), signalled)
+        fit(trainer)
     assert load_checkpoint(tmp_path / "parts" / "checkpoints")["step"] == 4  # the step at hand was finished
     parts = fit(make_trainer(tmp_path / "parts", **options))
     for name, value in whole.model.state_dict().items():
@@ -265,17 +269,18 @@ def test_non_finite_losses_leave_the_weights_alone_and_end_training(tmp_path):
 def test_a_bad_step_leaves_no_trace(tmp_path):
     """Running statistics too: a forward pass in training changes them before anyone knows that the loss is bad."""
     trainer = make_trainer(tmp_path, steps=30)
-    trainer.train_step(random_batch())
+    samples = trainer.fixed_points
+    trainer.train_step(random_batch(), samples)
     before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
     moments = [value.clone() for group in trainer.optimiser.state.values() for value in group.values()]
     good = random_batch()
     broken = replace(good, pose_vertices=torch.full_like(good.pose_vertices, float("inf")))
-    assert not math.isfinite(float(trainer.train_step(broken)[2]))
+    assert not math.isfinite(float(trainer.train_step(broken, samples)[2]))
     for name, value in trainer.model.state_dict().items():
         assert torch.equal(value, before[name]) or name.endswith("num_batches_tracked"), name
     after = [value for group in trainer.optimiser.state.values() for value in group.values()]
     assert all(torch.equal(a, b) for a, b in zip(moments, after))
-    trainer.train_step(good)
+    trainer.train_step(good, samples)
     trainer.save(0.0)
 
 

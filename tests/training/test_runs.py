@@ -11,11 +11,12 @@ from tiny import SETTINGS, quick_training
 from avatar.checks import AvatarError, DataError
 from avatar.data.mirroring import mirror_batch, mirror_map
 from avatar.data.splits import SplitConfig
+from avatar.environment import choose_device
 from avatar.io.points import read_points
 from avatar.simulate.sequences import authored_motion
 from avatar.training.loop import Trainer
 from avatar.training.prediction import body_batch, predict, predict_frames, predict_motion, template_samples
-from avatar.training.runs import MethodChoice, RunConfig, choose_device, load_run, train_run
+from avatar.training.runs import MethodChoice, RunConfig, load_run, train_run
 
 POSE = ("pose_vertices", "vertices", "vertex_transforms", "joint_transforms")
 TENSORS = (*POSE, "scan_points", "scan_normals", "outfit_ids")

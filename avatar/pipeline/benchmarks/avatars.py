@@ -46,7 +46,7 @@ def make_step(model: nn.Module, template: Template, batch: Batch, points: int) -
     """One optimiser step on a batch, points fixed as at full size, as the training loop takes it."""
     train = TrainConfig(points=points, batch=len(batch.names))
     trainer = Trainer(model, template.vertices, template.faces, train, Path("unused"))
-    return lambda: trainer.train_step(batch)
+    return lambda: trainer.train_step(batch, trainer.fixed_points)
 
 
 def make_prediction(model: nn.Module, template: Template, batch: Batch, points: int) -> Run:

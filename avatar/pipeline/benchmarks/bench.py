@@ -16,6 +16,7 @@ import torch
 
 from avatar.checks import AvatarError
 from avatar.data.outfits import SAFE_NAME
+from avatar.environment import choose_device
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.io.npz import write_whole
 from avatar.pipeline.benchmarks.avatars import predict_races, step_races
@@ -28,7 +29,6 @@ from avatar.pipeline.benchmarks.search import chamfer_races, nearest_races
 from avatar.pipeline.benchmarks.surfaces import canonicalizer_races, extraction_races, poisson_races, simulation_races
 from avatar.pipeline.benchmarks.tables import MACHINE, keep_others, to_markdown, to_scores
 from avatar.pipeline.scores import current_commit
-from avatar.training.runs import choose_device
 
 RACES: dict[str, Callable[[Job], list[Race]]] = {
     "nearest": nearest_races,

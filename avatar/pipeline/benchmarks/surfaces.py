@@ -41,7 +41,7 @@ def canonicalizer_races(job: Job) -> list[Race]:
         model = Canonicalizer(garment.template, frames, sizes).to(job.device)
         trainer = CycleTrainer(model, garment.template, scans, names, train, Path("unused"))
         trainer.step = train.first_steps + 1 if together else 0
-        return trainer.train_step
+        return lambda: trainer.train_step(trainer.batch_at(trainer.step).to(job.device))
 
     races = []
     for label in (label for label in job.canonicalizers if label == "small" or not job.quick):

@@ -1,0 +1,65 @@
+"""Batches prepared ahead of their step, so that a device does not wait for the disk and the processor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from avatar.records import map_tensors
+
+Records = tuple[Any, ...]  # dataclasses of tensors
+
+
+class Feed:
+    """The inputs of training steps on a device: while a step trains, a thread prepares those of the next one.
+
+    They are the same as without it, for they follow from the step alone. Used as a ``with`` block, at whose end,
+    whatever ends it, nothing goes on in the background. For CUDA they are copied from pinned memory, beside the work
+    of the step before.
+    """
+
+    def __init__(self, make: Callable[[int], Records], steps: int, device: torch.device):
+        """Prepares nothing yet.
+
+        Args:
+            make: the inputs of a step; called in another thread, by one call at a time, and never for two steps past
+                the one at hand.
+            steps: how many there are; none is prepared beyond.
+            device: where they go.
+        """
+        self.make, self.steps, self.device = make, steps, device
+        self.pinned = device.type == "cuda"
+        options = {"initializer": torch.cuda.set_device, "initargs": (device,)} if self.pinned else {}
+        self.thread = ThreadPoolExecutor(1, "feed", **options)
+        self.ahead: dict[int, Future[Records]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.thread.shutdown(cancel_futures=True)
+
+    def __call__(self, step: int) -> Records:
+        """The inputs of a step, on the device. What `make` raises for a step is raised here, at that step."""
+        ready = self.ahead.pop(step, None) or self.thread.submit(self._prepare, step)
+        records = ready.result()
+        self.ahead = {step + 1: self.thread.submit(self._prepare, step + 1)} if step + 1 < self.steps else {}
+        return to_device(records, self.device)
+
+    def _prepare(self, step: int) -> Records:
+        records = self.make(step)
+        return tuple(map_tensors(record, pin) for record in records) if self.pinned else records
+
+
+def pin(tensor: Tensor) -> Tensor:
+    """The tensor in memory that a device can read by itself, where it is the processor's."""
+    return tensor.pin_memory() if tensor.device.type == "cpu" else tensor
+
+
+def to_device(records: Records, device: torch.device) -> Records:
+    """Records with their tensors on a device; from pinned memory without waiting for the copy."""
+    return tuple(map_tensors(record, lambda tensor: tensor.to(device, non_blocking=True)) for record in records)
