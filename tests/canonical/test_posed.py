@@ -61,8 +61,13 @@ def test_canonical_body_is_the_template_plus_what_the_pose_added():
 
 @pytest.mark.parametrize("mesh", [False, True])
 def test_points_lie_on_the_scan_and_know_their_nearest_vertex(mesh):
-    scan = prepare_scan(arm_frame(0.0, mesh=mesh), arm_template(), 400)
-    assert len(scan.points) == 400
+    frame = arm_frame(0.0, mesh=mesh)
+    if not mesh:  # as a scanner's stripes: whatever is drawn must not be the first ones
+        order = np.argsort(frame.scan.canonical[:, 1])
+        frame = replace(frame, scan=Scan(frame.scan.points[order], frame.scan.normals[order]))
+    scan = prepare_scan(frame, arm_template(), 400)
+    assert len(scan.points) == len(scan.edges) == 400
+    assert float(scan.edges[..., 1].min()) < 0.05 and float(scan.edges[..., 1].max()) > 0.95
     around = scan.points[:, [0, 2]].norm(dim=1)
     assert float(around.max()) <= SLEEVE + 1e-5 and float(around.min()) > 0.98 * SLEEVE  # a tube of flat faces
     assert float(scan.points[:, 1].min()) < 0.05 and float(scan.points[:, 1].max()) > 0.95
@@ -82,6 +87,13 @@ def test_mean_curvature_of_a_sphere_is_exact_and_turns_sign_with_it(count):
     points, normals = sphere(count, 0.25)
     np.testing.assert_allclose(mean_curvature(points, normals), 4.0, rtol=1e-6)
     np.testing.assert_allclose(mean_curvature(points, -normals), -4.0, rtol=1e-6)
+
+
+def test_curvature_is_measured_all_over_a_large_scan():
+    """The neighbours come from a thinned cloud, thinned evenly: a part that stands last in the file has its own."""
+    (large, outward), (small, out) = sphere(12_000, 0.25), sphere(12_000, 0.1)
+    found = mean_curvature(np.concatenate([large, small + 5]), np.concatenate([outward, out]))
+    np.testing.assert_allclose(found, np.repeat([4.0, 10.0], 12_000), rtol=1e-6)
 
 
 def test_mean_curvature_of_a_tube_is_half_of_one_over_its_radius_and_of_a_plane_nothing():
