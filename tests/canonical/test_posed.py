@@ -9,6 +9,7 @@ from limbs import RADIUS, SLEEVE, arm_frame, arm_template
 
 from avatar.body.skinning import chain_transforms, skin_transforms
 from avatar.canonical.edges import CONCAVE, mean_curvature, smooth_edges
+from avatar.canonical.fields import bounding_box
 from avatar.canonical.posed import DrawConfig, draw_batch, local_pose, prepare_scan
 from avatar.geometry.transforms import assemble_transform, rotation_from_axis_angle, transform_points
 from avatar.records import BodyFit, Scan
@@ -74,6 +75,14 @@ def test_points_lie_on_the_scan_and_know_their_nearest_vertex(mesh):
     distances = torch.cdist(scan.points, scan.body)
     torch.testing.assert_close(distances.gather(1, scan.nearest[:, None])[:, 0], distances.min(dim=1).values)
     assert float(distances.min()) == pytest.approx(SLEEVE - RADIUS, abs=0.004)
+
+
+def test_body_vertices_are_drawn_by_area_and_the_box_is_the_posed_body_s():
+    frame, template = arm_frame(0.8), arm_template()
+    half = replace(template, faces=template.faces[template.faces.amax(dim=1) < 480])
+    scan = prepare_scan(frame, half, 500)
+    assert 400 < scan.vertices.max() < 480  # the others have no triangle, and no area
+    torch.testing.assert_close(scan.box, bounding_box(scan.body))
 
 
 def sphere(count: int, radius: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
