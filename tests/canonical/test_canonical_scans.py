@@ -75,6 +75,14 @@ def test_stretched_triangles_go_and_points_without_any_with_them():
     assert np.array_equal(kept, np.arange(1, 12)) and faces.max() == 10 and len(faces) == 7
 
 
+@pytest.mark.parametrize("first", range(3))
+def test_any_one_edge_that_is_stretched_cuts_a_triangle(first):
+    near, after = ([[0.0, 0, 0], [1, 0, 0], [along, 0, 0]] for along in (0.1, 0.6))
+    scan = Scan(np.array(near), np.zeros((3, 3)), np.roll([[0, 1, 2]], first))
+    assert len(cut_stretched(scan, np.array(after), 5.5)[1]) == 0  # the edge from third to first is six times longer
+    assert len(cut_stretched(scan, np.array(after), 6.5)[1]) == 1
+
+
 def test_edges_that_shrink_or_have_no_length_are_not_stretched():
     edges = np.array([[0, 1], [1, 2], [0, 0]])
     before, after = np.eye(3), 0.1 * np.eye(3)

@@ -53,6 +53,19 @@ def test_true_weights_carry_the_sleeve_home_and_back(monkeypatch):
     assert cycle.edge_weights.shape == (2, 30, 2, 3)
 
 
+def test_points_go_there_by_the_inverse_field_and_back_by_the_forward_one():
+    model, batch = make(), batch_of(0, 2)
+    cycle = model(batch, model.batch_codes(batch), together=True)
+    for weights, start, end in (
+        (cycle.scan_weights, cycle.canonical, batch.points),
+        (cycle.canonical_weights, cycle.canonical, cycle.reposed),
+    ):
+        moved = transform_points(skin_transforms(weights, batch.joint_transforms), start)
+        torch.testing.assert_close(moved, end, atol=1e-5, rtol=0)
+    torch.testing.assert_close(cycle.canonical_weights, model.canonical_weights(cycle.canonical))
+    assert (cycle.canonical_weights - cycle.scan_weights).abs().max() > 1e-3
+
+
 def test_apart_the_inverse_field_learns_nothing_from_the_forward_one_and_together_it_does():
     model, batch = make(), batch_of(0, 1)
     for together in (False, True):

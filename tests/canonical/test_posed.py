@@ -9,6 +9,7 @@ from limbs import RADIUS, SLEEVE, arm_frame, arm_template
 
 from avatar.body.skinning import chain_transforms, skin_transforms
 from avatar.canonical.edges import CONCAVE, mean_curvature, smooth_edges
+from avatar.canonical.fields import bounding_box
 from avatar.canonical.posed import DrawConfig, draw_batch, local_pose, prepare_scan
 from avatar.geometry.transforms import assemble_transform, rotation_from_axis_angle, transform_points
 from avatar.records import BodyFit, Scan
@@ -61,14 +62,27 @@ def test_canonical_body_is_the_template_plus_what_the_pose_added():
 
 @pytest.mark.parametrize("mesh", [False, True])
 def test_points_lie_on_the_scan_and_know_their_nearest_vertex(mesh):
-    scan = prepare_scan(arm_frame(0.0, mesh=mesh), arm_template(), 400)
-    assert len(scan.points) == 400
+    frame = arm_frame(0.0, mesh=mesh)
+    if not mesh:  # as a scanner's stripes: whatever is drawn must not be the first ones
+        order = np.argsort(frame.scan.canonical[:, 1])
+        frame = replace(frame, scan=Scan(frame.scan.points[order], frame.scan.normals[order]))
+    scan = prepare_scan(frame, arm_template(), 400)
+    assert len(scan.points) == len(scan.edges) == 400
+    assert float(scan.edges[..., 1].min()) < 0.05 and float(scan.edges[..., 1].max()) > 0.95
     around = scan.points[:, [0, 2]].norm(dim=1)
     assert float(around.max()) <= SLEEVE + 1e-5 and float(around.min()) > 0.98 * SLEEVE  # a tube of flat faces
     assert float(scan.points[:, 1].min()) < 0.05 and float(scan.points[:, 1].max()) > 0.95
     distances = torch.cdist(scan.points, scan.body)
     torch.testing.assert_close(distances.gather(1, scan.nearest[:, None])[:, 0], distances.min(dim=1).values)
     assert float(distances.min()) == pytest.approx(SLEEVE - RADIUS, abs=0.004)
+
+
+def test_body_vertices_are_drawn_by_area_and_the_box_is_the_posed_body_s():
+    frame, template = arm_frame(0.8), arm_template()
+    half = replace(template, faces=template.faces[template.faces.amax(dim=1) < 480])
+    scan = prepare_scan(frame, half, 500)
+    assert 400 < scan.vertices.max() < 480  # the others have no triangle, and no area
+    torch.testing.assert_close(scan.box, bounding_box(scan.body))
 
 
 def sphere(count: int, radius: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -82,6 +96,13 @@ def test_mean_curvature_of_a_sphere_is_exact_and_turns_sign_with_it(count):
     points, normals = sphere(count, 0.25)
     np.testing.assert_allclose(mean_curvature(points, normals), 4.0, rtol=1e-6)
     np.testing.assert_allclose(mean_curvature(points, -normals), -4.0, rtol=1e-6)
+
+
+def test_curvature_is_measured_all_over_a_large_scan():
+    """The neighbours come from a thinned cloud, thinned evenly: a part that stands last in the file has its own."""
+    (large, outward), (small, out) = sphere(12_000, 0.25), sphere(12_000, 0.1)
+    found = mean_curvature(np.concatenate([large, small + 5]), np.concatenate([outward, out]))
+    np.testing.assert_allclose(found, np.repeat([4.0, 10.0], 12_000), rtol=1e-6)
 
 
 def test_mean_curvature_of_a_tube_is_half_of_one_over_its_radius_and_of_a_plane_nothing():

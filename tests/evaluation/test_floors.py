@@ -57,7 +57,7 @@ def test_body_floor_is_the_gap_between_body_and_cloth(ball):
     scores = score_body_floor(ball, "test", CONFIG, 20_000)
     assert values(scores)["s2m_cm"] == pytest.approx(10, abs=0.1)
     assert values(scores)["cd_pop"] == pytest.approx(2 * 0.1**2, rel=0.1)
-    assert {row.method for row in scores.rows} == {"body"}
+    assert {(row.method, row.points) for row in scores.rows} == {("body", 20_000)}
     assert "jitter" not in values(scores)
 
 

@@ -138,6 +138,9 @@ def test_f_score_counts():
     to_points = torch.tensor([0.005, 0.03, 0.04, 0.05, 0.06])  # 1 of 5
     assert float(f_score(to_scan, to_points, 5e-3)) == pytest.approx(2 * 0.5 * 0.2 / 0.7)
     assert float(f_score(to_scan + 1, to_points, 5e-3)) == 0
+    for name, threshold in (("f_score_5mm", 0.005), ("f_score_1cm", 0.01)):
+        for height, score in ((0.99 * threshold, 1), (1.01 * threshold, 0)):
+            assert measure(name, compare(plane(height), plane())) == score
 
 
 def test_disc_distance_sees_a_hole_that_planes_would_hide():
@@ -171,6 +174,17 @@ def test_penetration_is_measured_all_over_a_large_prediction(sphere_cloud):
     assert PENETRATION_POINTS / 2 < len(comparison.depths) <= PENETRATION_POINTS
     assert measure("penetration_share", comparison) == pytest.approx(3000 / len(points), abs=1e-3)
     assert measure("penetration_depth", comparison) == pytest.approx(0.05, abs=1e-3)
+
+
+def test_shallow_penetration_is_exact_on_a_body_of_long_triangles():
+    body = trimesh.creation.cylinder(radius=0.3, height=2.0, sections=48)
+    angle, up = np.random.default_rng(0).uniform([0, -0.9], [2 * np.pi, 0.9], (500, 2)).T
+    around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    points = 0.295 * around + np.stack([0 * up, 0 * up, up], axis=1)
+    comparison = compare((points, around), (points, around), body=Mesh(body.vertices, body.faces))
+    half = np.pi / 48
+    below_the_flats = 0.3 * np.cos(half) - 0.295 * np.cos(angle % (2 * half) - half)
+    np.testing.assert_allclose(comparison.depths, below_the_flats, atol=1e-6)
 
 
 def test_no_penetration_outside_and_none_of_the_body_itself(sphere_cloud):

@@ -46,6 +46,14 @@ def test_vertex_normals_point_out_of_a_sphere_and_up_from_a_floor():
     torch.testing.assert_close(vertex_normals(floor, FACES), torch.tensor([0.0, 1, 0]).expand(1, 4, 3))
 
 
+def test_vertex_normals_are_weighted_by_area():
+    """A wall and a floor that meet along z, the wall twice as large."""
+    vertices = torch.tensor([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 2, 0]])
+    normals = vertex_normals(vertices, torch.tensor([[0, 1, 2], [0, 3, 1]]))
+    torch.testing.assert_close(normals[:2], torch.tensor([2.0, 1, 0]).expand(2, 3) / 5**0.5)
+    torch.testing.assert_close(normals[2:], torch.tensor([[0.0, 1, 0], [1, 0, 0]]))
+
+
 def test_vertex_normals_of_millimetre_triangles_and_unused_vertices():
     vertices, faces = sphere()
     tiny = torch.cat([vertices.float() * 1e-3, torch.zeros(1, 3)])

@@ -73,6 +73,14 @@ def test_features_are_quaternions_times_attention():
     torch.testing.assert_close(features, torch.tensor([1.0, 1.0, 0.0, 0.0])[None, None, :, None] * quaternions)
 
 
+@pytest.mark.parametrize("attention", list(Attention))
+def test_a_point_attends_as_the_joints_it_is_skinned_to_do(attention):
+    """Skinned to one joint alone, the root among them, it sees what the column of that joint says (eq. 18)."""
+    rest = torch.eye(4).expand(1, 5, 4, 4)
+    gates = PoseGate(FORK, 1, attention)(torch.eye(5)[None], rest).unflatten(-1, (4, 4))[0, :, :, 0]
+    torch.testing.assert_close(gates, attention_map(FORK, 1, attention, False)[1:].T)
+
+
 def test_wrong_joints_are_refused():
     gate = PoseGate(FORK)
     with pytest.raises(AvatarError, match="weights"):

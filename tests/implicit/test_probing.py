@@ -38,6 +38,9 @@ def test_points_lie_where_they_are_said_to():
     assert (about_body.norm(dim=-1) - 1).abs().mean() < 0.12
     spread = torch.cdist(about_scan, scan).min(dim=-1).values.mean()
     assert 0.05 < spread < 0.2
+    _, still = draw(near_distance=1e-9)  # the same draw unshaken
+    shaken = (space.near - still.near) / 0.1
+    assert shaken.mean().abs() < 0.1 and float(shaken.std()) == pytest.approx(1, abs=0.1)
     for points in (space.empty, space.rim):
         assert (points >= BOX[0]).all() and (points <= BOX[1]).all()
     assert (space.empty.amax(dim=1) > 0.9 * BOX[1]).all() and (space.empty.amin(dim=1) < 0.9 * BOX[0]).all()

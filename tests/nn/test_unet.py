@@ -21,13 +21,17 @@ def test_pop_and_scale_have_their_sizes():
 
 
 def test_four_levels_written_out():
-    """POP's recipe with its one transposed convolution, in training mode: statistics of the batch itself."""
+    """POP's recipe with its one transposed convolution; by running statistics, which hide no scale or bias."""
     torch.manual_seed(0)
-    net = UNet(3, UNetConfig(levels=4, width=4, out_channels=5)).double()
+    net = UNet(3, UNetConfig(levels=4, width=4, out_channels=5, affine=True)).double().eval()
     image = torch.randn(2, 3, 32, 32, dtype=torch.float64)
+    for norm in [module for module in net.modules() if isinstance(module, torch.nn.BatchNorm2d)]:
+        for value in (norm.weight.data, norm.bias.data, norm.running_mean, norm.running_var):
+            value.copy_(0.5 + torch.rand_like(value))
 
-    def normed(x):
-        return batch_norm(x, None, None, training=True)
+    def normed(x, block):
+        norm = block[-1]
+        return batch_norm(x, norm.running_mean, norm.running_var, norm.weight, norm.bias)
 
     def smooth(x, layer):
         x = interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
@@ -35,12 +39,12 @@ def test_four_levels_written_out():
 
     kernels = [next(m.weight for m in down if isinstance(m, torch.nn.Conv2d)) for down in net.downs]
     first = conv2d(image, kernels[0], stride=2, padding=1)
-    second = normed(conv2d(leaky_relu(first, 0.2), kernels[1], stride=2, padding=1))
-    third = normed(conv2d(leaky_relu(second, 0.2), kernels[2], stride=2, padding=1))
+    second = normed(conv2d(leaky_relu(first, 0.2), kernels[1], stride=2, padding=1), net.downs[1])
+    third = normed(conv2d(leaky_relu(second, 0.2), kernels[2], stride=2, padding=1), net.downs[2])
     deepest = conv2d(leaky_relu(third, 0.2), kernels[3], stride=2, padding=1)
-    up = normed(conv_transpose2d(relu(deepest), net.ups[0][1].weight, stride=2, padding=1))
+    up = normed(conv_transpose2d(relu(deepest), net.ups[0][1].weight, stride=2, padding=1), net.ups[0])
     for skip, layer in ((third, net.ups[1]), (second, net.ups[2])):
-        up = normed(smooth(relu(torch.cat([up, skip], dim=1)), layer[2]))
+        up = normed(smooth(relu(torch.cat([up, skip], dim=1)), layer[2]), layer)
     up = smooth(relu(torch.cat([up, first], dim=1)), net.ups[3][2])
     torch.testing.assert_close(net(image), up)
     assert up.shape == (2, 5, 32, 32)

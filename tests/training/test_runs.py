@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from tiny import SETTINGS, quick_training
 
 from avatar.checks import AvatarError, DataError
-from avatar.data.mirroring import mirror_batch, mirror_map
+from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
 from avatar.data.splits import SplitConfig
 from avatar.environment import choose_device
 from avatar.io.points import read_points
@@ -116,15 +116,14 @@ def test_a_mirroring_run_learns_from_half_of_its_frames_in_a_mirror(settings, ti
     monkeypatch.setattr(Trainer, "fit", note)
     for mirror in (False, True):
         train_run(replace(settings, name=f"mirror-{mirror}", train=replace(settings.train, mirror=mirror, seed=2)))
-    symmetry, seen = mirror_map(tiny_outfit.template), []
-    for before, after in zip(drawn[False][0], drawn[True][0]):
+    symmetry, coins = mirror_map(tiny_outfit.template), [mirror_coins(2, step, 2) for step in range(6)]
+    assert 3 <= sum(map(sum, coins)) <= 9
+    for before, after, chosen in zip(*(drawn[mirror][0] for mirror in (False, True)), coins, strict=True):
         image = mirror_batch(before, torch.tensor([True, True]), symmetry)
-        for row in range(2):
-            seen.append(not torch.equal(before.scan_points[row], after.scan_points[row]))
-            source = image if seen[-1] else before
+        for row, turned in enumerate(chosen):
+            assert turned == (not torch.equal(before.scan_points[row], after.scan_points[row]))
             for field in TENSORS:
-                assert torch.equal(getattr(after, field)[row], getattr(source, field)[row]), field
-    assert 3 <= sum(seen) <= 9 and seen[::2] != seen[1::2]
+                assert torch.equal(getattr(after, field)[row], getattr(image if turned else before, field)[row]), field
     for before, after in zip(drawn[False][1], drawn[True][1], strict=True):  # what is held back is left as it is
         assert all(torch.equal(getattr(before, field), getattr(after, field)) for field in TENSORS)
 
