@@ -2,12 +2,14 @@
 
 import shutil
 
+import pretended
 import pytest
 from tiny import write_tiny_outfit
 
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.scanner import ScanConfig
 
+pretended.install()  # before any backward pass: torch counts its devices once, at the first
 CHROMIUM_FLAGS = (
     "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync "
     "--disable-quic --no-first-run"
