@@ -2,6 +2,7 @@
 
 import shutil
 
+import pretended
 import pytest
 from smpl_person import BETAS, person_model, write_model, write_person
 from tiny import write_tiny_outfit
@@ -10,6 +11,7 @@ from avatar.body.convert import convert_body_model
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.scanner import ScanConfig
 
+pretended.install()  # before any backward pass: torch counts its devices once, at the first
 CHROMIUM_FLAGS = (
     "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync "
     "--disable-quic --no-first-run"

@@ -19,6 +19,28 @@ CROSSING = {aten.copy_.default, aten._to_copy.default}  # they move values betwe
 INDEXING = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default, aten._index_put_impl_.default}
 SCALARS = {aten.fill_.Tensor, aten.where.self, aten.masked_fill.Tensor, aten.masked_fill_.Tensor}
 used: set[str] = set()  # names of the operations that have run on the device
+BY_CHANCE = {  # those whose order of additions is another one each time on CUDA, or on the CPU's threads
+    "index_add",
+    "index_put, accumulating",
+    "index_reduce",
+    "scatter_add",
+    "scatter_reduce",
+    "put",
+    "cumsum",
+    "bincount",
+    "histc",
+    "grid_sampler_2d_backward",
+    "grid_sampler_3d_backward",
+    "upsample_linear1d_backward",
+    "upsample_bilinear2d_backward",
+    "upsample_nearest2d_backward",
+    "max_pool3d_with_indices_backward",
+    "adaptive_avg_pool2d_backward",
+    "reflection_pad2d_backward",
+    "replication_pad2d_backward",
+    "embedding_dense_backward",
+    "segment_reduce_backward",
+}
 
 
 class PretendedTensor(torch.Tensor):
@@ -42,6 +64,9 @@ class PretendedTensor(torch.Tensor):
         """Numbers of Python, as every device gives them."""
         return self.detach().cpu().tolist()
 
+    def __repr__(self):
+        return f"{NAME} {self.inner!r}"
+
     def __reduce_ex__(self, protocol):
         return torch._utils._rebuild_device_tensor_from_cpu_tensor, (
             self.detach().cpu(),
@@ -53,7 +78,7 @@ class PretendedTensor(torch.Tensor):
     @classmethod
     def __torch_dispatch__(cls, operation, types, args=(), kwargs=None):
         kwargs = kwargs or {}
-        used.add(operation._schema.name)
+        used.add(plain_name(operation, args))
         check_devices(operation, args, kwargs)
         if torch.Tag.inplace_view in operation.tags:
             raise NotImplementedError(f"{operation}: changes the shape of a tensor in place.")
@@ -66,6 +91,13 @@ class PretendedTensor(torch.Tensor):
         if operation is aten.copy_.default:
             return args[0]
         return return_and_correct_aliasing(operation, args, kwargs, tree_map(wrap, found))
+
+
+def plain_name(operation, args) -> str:
+    """An operation's name whatever it writes to, and whether it adds up what it puts."""
+    name = operation._schema.name.removeprefix("aten::").strip("_").removesuffix("_impl")
+    accumulates = name == "index_put" and len(args) > 3 and args[3]
+    return f"{name}, accumulating" if accumulates else name
 
 
 def unwrap(value):

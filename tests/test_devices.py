@@ -180,7 +180,7 @@ def test_a_method_trained_resumed_and_predicted_on_the_device_is_the_cpus(runs, 
             train(replace(run, train=replace(run.train, steps=1)))
         folder = train(run)
         (points,) = predict(PredictConfig(run=folder, points=1000, device=kind, surface=ExtractionConfig(16, 8)))
-        assert bool(pretended.used) == (kind == "auto")
+        assert bool(pretended.used) == (kind == "auto") and not pretended.used & pretended.BY_CHANCE
         clouds.append([read_points(path) for path in sorted(points.glob("*.ply"))])
     assert_alike(*(weights_of(run.runs_root / name / "open" / run.outfit[0] / "default") for run in runs.values()))
     for mine, theirs in zip(*clouds, strict=True):

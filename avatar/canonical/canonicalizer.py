@@ -12,6 +12,7 @@ from avatar.body.skinning import skin_transforms
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
 from avatar.canonical.posed import ScanBatch
 from avatar.checks import AvatarError
+from avatar.geometry.bags import pick
 from avatar.geometry.transforms import invert_affine, transform_points
 from avatar.records import Template
 
@@ -92,7 +93,7 @@ class Canonicalizer(nn.Module):
 
     def batch_codes(self, batch: ScanBatch) -> Tensor:
         """What the inverse field is told of each frame of a batch, ``(B, L)``."""
-        return batch.poses if self.config.latent is Latent.pose else self.codes[batch.frames]
+        return batch.poses if self.config.latent is Latent.pose else pick(self.codes, batch.frames)
 
     def transforms(self, weights: Tensor, joint_transforms: Tensor) -> Tensor:
         """LBS: posed_from_canonical ``(B, N, 4, 4)`` of points with weights ``(B, N, J)``."""

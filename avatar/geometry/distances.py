@@ -23,12 +23,6 @@ def correspond(points: Tensor, scan: Tensor) -> Correspondences:
     return Correspondences(*nearest_both_ways(points, scan))
 
 
-def gather_points(values: Tensor, ids: Tensor) -> Tensor:
-    """Rows of ``(B, M, C)`` picked by ``(B, N)`` indices: ``(B, N, C)``."""
-    check_shape("values", values, "B M C")
-    return values.gather(1, ids.unsqueeze(-1).expand(-1, -1, values.shape[-1]))
-
-
 def point_to_point(points: Tensor, anchors: Tensor) -> Tensor:
     """Squared distance of each point to its anchor (CloSET eq. 4). ``(B, N, 3)`` twice to ``(B, N)``, m^2."""
     dims = check_shape("points", points, "B N 3")

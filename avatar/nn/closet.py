@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.bags import pick
 from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, bare_body
@@ -155,15 +156,15 @@ class ClosetAvatar(nn.Module):
             raise AvatarError("wrinkles: a model without explicit garment template has nothing else to predict.")
         outfits = batch.outfits
         row = torch.searchsorted(outfits, batch.outfit_ids)
-        codes = self.codes[outfits]
+        codes = pick(self.codes, outfits)
         garment = self.surface_features(codes, samples)
         parts = []
         if self.config.template:
             decoded = self.garment_decoder(garment)
-            parts.append(Decoded(decoded.offsets[row], decoded.normals[row]))
+            parts.append(Decoded(pick(decoded.offsets, row), pick(decoded.normals, row)))
         if self.config.pose and wrinkles:
             pose = self.pose_features(batch, samples)
-            parts.append(self.pose_decoder(torch.cat([pose, garment[row]], dim=-1)))
+            parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1)))
         local = sum(parts, bare_body(self.skin_normals, samples, self.config.normals))
 
         scale = self.config.offset_scale

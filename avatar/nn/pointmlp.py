@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
+from avatar.geometry.bags import Bags
 from avatar.geometry.neighbours import k_nearest
-from avatar.nn.hierarchy import Level, build_levels
+from avatar.nn.hierarchy import FixedBags, Level, build_levels
 from avatar.nn.pointnet2 import PointNet2Config, PointNorm, SurfaceEncoder
 from avatar.records import Template
 
@@ -57,7 +58,7 @@ class PointMLPLevel(nn.Module):
         *inner, width = widths
         self.level = level
         own = k_nearest(level.positions[None], level.finer_positions[None], 1)[0, :, 0]
-        self.register_buffer("own", own, persistent=False)  # each centre in the finer level
+        self.own = FixedBags(Bags.of_table(own[:, None], len(level.finer_positions)))  # each centre in the finer level
         self.affine = GeometricAffine(channels + 3)
         self.difference_layer = nn.Linear(channels + 3, width, bias=False)
         self.centre_layer = nn.Linear(channels + 3, width)
@@ -69,7 +70,7 @@ class PointMLPLevel(nn.Module):
         """``(B, N, C)`` features of the finer level to ``(B, S, C')`` of the coarser."""
         positions = self.level.finer_positions.to(features.dtype).expand(len(features), -1, -1)
         joined = torch.cat([features, positions], dim=-1)
-        centres = joined[:, self.own]
+        centres = self.own(joined)
         grouped = self.difference_layer(self.affine(self.level.group(joined), centres))
         lifted = relu(self.norm(grouped + self.centre_layer(centres).unsqueeze(2)))
         return self.after(self.before(lifted).amax(dim=2))

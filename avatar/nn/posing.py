@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from avatar.body.skinning import skin_transforms
 from avatar.checks import AvatarError
+from avatar.geometry.bags import pick
 from avatar.geometry.surface import interpolate
 from avatar.records import SurfaceSamples, Template
 
@@ -58,8 +59,7 @@ class LearnedSkinning(nn.Module):
         Returns:
             ``(B, N, 4, 4)``.
         """
-        weights = points.new_empty(*points.shape[:2], joint_transforms.shape[1])
-        for outfit in outfit_ids.unique().tolist():
-            rows = outfit_ids == outfit
-            weights[rows] = self.fields[outfit](points[rows])
+        frames = {outfit: (outfit_ids == outfit).nonzero()[:, 0] for outfit in outfit_ids.unique().tolist()}
+        weights = torch.cat([self.fields[outfit](pick(points, rows)) for outfit, rows in frames.items()])
+        weights = pick(weights, torch.cat(list(frames.values())).argsort())
         return skin_transforms(weights, joint_transforms, self.binds[outfit_ids])

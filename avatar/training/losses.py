@@ -8,9 +8,9 @@ from enum import Enum
 from torch import Tensor
 
 from avatar.checks import AvatarError
+from avatar.geometry.bags import gather_rows
 from avatar.geometry.distances import (
     correspond,
-    gather_points,
     normal_difference,
     point_to_plane,
     point_to_point,
@@ -65,13 +65,13 @@ def point_avatar_loss(prediction: Prediction, batch: Batch, config: LossConfig, 
         (mean over the three components, as POP's code averages it).
     """
     found = correspond(prediction.points.detach(), batch.scan_points)
-    anchors = gather_points(batch.scan_points, found.scan_of_point)
-    anchor_normals = gather_points(batch.scan_normals, found.scan_of_point)
+    anchors = gather_rows(batch.scan_points, found.scan_of_point)
+    anchor_normals = gather_rows(batch.scan_normals, found.scan_of_point)
     if config.chamfer is Chamfer.plane:
         to_scan = point_to_plane(prediction.points, anchors, anchor_normals)
     else:
         to_scan = point_to_point(prediction.points, anchors)
-    to_points = point_to_point(batch.scan_points, gather_points(prediction.points, found.point_of_scan))
+    to_points = point_to_point(batch.scan_points, gather_rows(prediction.points, found.point_of_scan))
     raw = {
         "scan_to_points": to_points.mean(),
         "points_to_scan": to_scan.mean(),

@@ -1,10 +1,11 @@
 """Bags of rows against the loop they stand for, their transpose against the matrix's, gradients of both orders."""
 
+import pretended
 import pytest
 import torch
 
 from avatar.checks import AvatarError
-from avatar.geometry.bags import Bags, sum_bags
+from avatar.geometry.bags import Bags, gather_rows, pick, sum_bags
 
 SOURCE = torch.Generator().manual_seed(0)
 TABLE = torch.randint(0, 9, (20, 3), generator=SOURCE)  # of 12 rows, so that three are in no bag
@@ -64,3 +65,38 @@ def test_gradients_do_not_depend_on_the_number_of_threads():
 def test_values_of_another_number_of_rows_are_refused():
     with pytest.raises(AvatarError, match="V=12"):
         sum_bags(torch.zeros(11, 3), Bags.of_table(TABLE, 12))
+
+
+@pytest.mark.parametrize("device", ["cpu", pretended.NAME])
+def test_picked_rows_and_their_gradients_agree_with_the_loop(device):
+    ids = torch.randint(0, 5, (2, 40), generator=SOURCE)  # of 7 rows: many more than once, two never
+    values = torch.randn(2, 7, 3, dtype=torch.float64, generator=SOURCE)
+    gradient = torch.randn(2, 40, 3, dtype=torch.float64, generator=SOURCE)
+    rows, back = torch.zeros_like(gradient), torch.zeros_like(values)
+    for frame in range(2):
+        for place, row in enumerate(ids[frame].tolist()):
+            rows[frame, place] = values[frame, row]
+            back[frame, row] += gradient[frame, place]
+    there = values.to(device).requires_grad_()
+    found = gather_rows(there, ids.to(device))
+    assert torch.equal(found.cpu(), rows)
+    (found,) = torch.autograd.grad(found, there, gradient.to(device))
+    torch.testing.assert_close(found.cpu(), back)
+    one = pick(there[0], ids[0].to(device))
+    assert torch.equal(one.cpu(), rows[0])
+    (found,) = torch.autograd.grad(one, there, gradient[0].to(device))
+    torch.testing.assert_close(found.cpu(), torch.stack([back[0], 0 * back[1]]))
+
+
+@pytest.mark.parametrize("device", ["cpu", pretended.NAME])
+def test_picking_and_its_backward_pass_are_repeatable(device):
+    """No operation that torch knows to add in an order of chance, on the CPU or on a device."""
+    torch.use_deterministic_algorithms(True)
+    try:
+        pretended.used.clear()
+        values, ids = torch.randn(2, 9, 4, generator=SOURCE), torch.randint(0, 9, (2, 30), generator=SOURCE)
+        there, ids = values.to(device).requires_grad_(), ids.to(device)
+        (gather_rows(there, ids).square().sum() + pick(there, ids[0].clamp(max=1)).square().sum()).backward()
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert bool(pretended.used) == (device != "cpu") and not pretended.used & pretended.BY_CHANCE

@@ -7,9 +7,9 @@ import torch
 from reference import chamfer_loop
 
 from avatar.checks import AvatarError
+from avatar.geometry.bags import gather_rows
 from avatar.geometry.distances import (
     correspond,
-    gather_points,
     normal_difference,
     point_to_plane,
     point_to_point,
@@ -28,8 +28,8 @@ def unit(vectors: torch.Tensor) -> torch.Tensor:
 def test_chamfer_agrees_with_loop():
     points, scan = random_points(2, 30, seed=0), random_points(2, 20, seed=1)
     pairs = correspond(points, scan)
-    there = point_to_point(points, gather_points(scan, pairs.scan_of_point)).mean(dim=-1)
-    back = point_to_point(scan, gather_points(points, pairs.point_of_scan)).mean(dim=-1)
+    there = point_to_point(points, gather_rows(scan, pairs.scan_of_point)).mean(dim=-1)
+    back = point_to_point(scan, gather_rows(points, pairs.point_of_scan)).mean(dim=-1)
     for b in range(2):
         assert (float(there[b]), float(back[b])) == pytest.approx(chamfer_loop(points[b].numpy(), scan[b].numpy()))
 
@@ -41,7 +41,7 @@ def test_plane_above_plane():
     lifted = grid + torch.tensor([0.2, 0.1, 0.0], dtype=torch.float64)
     ids = correspond(lifted, grid).scan_of_point
     assert ids.tolist() == [list(range(25))]
-    anchors = gather_points(grid, ids)
+    anchors = gather_rows(grid, ids)
     torch.testing.assert_close(point_to_point(lifted, anchors), torch.full((1, 25), 0.05, dtype=torch.float64))
     torch.testing.assert_close(point_to_plane(lifted, anchors, up), torch.full((1, 25), 0.01, dtype=torch.float64))
 
@@ -51,7 +51,7 @@ def test_sphere_inside_sphere():
     directions = unit(random_points(1, 200, seed=0))
     ids = correspond(1.1 * directions, directions).scan_of_point
     assert torch.equal(ids[0], torch.arange(200))
-    anchors = gather_points(directions, ids)
+    anchors = gather_rows(directions, ids)
     expected = torch.full((1, 200), 0.01, dtype=torch.float64)
     torch.testing.assert_close(point_to_point(1.1 * directions, anchors), expected)
     torch.testing.assert_close(point_to_plane(1.1 * directions, anchors, anchors), expected)
@@ -88,10 +88,10 @@ def test_coinciding_points_have_zero_distance_and_gradient():
     assert distances.abs().max() == 0 and points.grad.abs().max() == 0
 
 
-def test_gather_points_picks_rows_of_each_batch():
+def test_gather_rows_picks_rows_of_each_batch():
     values = torch.arange(12.0).reshape(2, 3, 2)
     ids = torch.tensor([[2, 0], [1, 1]])
-    assert gather_points(values, ids).tolist() == [[[4, 5], [0, 1]], [[8, 9], [8, 9]]]
+    assert gather_rows(values, ids).tolist() == [[[4, 5], [0, 1]], [[8, 9], [8, 9]]]
 
 
 def test_shapes_are_checked():

@@ -6,11 +6,12 @@ import pytest
 import torch
 from cut_sphere import ATLASED, both_sides_of_a_seam
 from spheres import DECODER, TEMPLATE, random_batch, small_config
+from torch.nn.functional import grid_sample
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.nn.baselines.atlas import Atlas, look_up
+from avatar.nn.baselines.atlas import Atlas, LookUp
 from avatar.nn.baselines.pop import PointSource, PopAvatar, PopConfig
 from avatar.nn.baselines.unet import UNetConfig
 from avatar.nn.closet import ClosetAvatar
@@ -100,11 +101,35 @@ def test_look_up_is_bilinear_between_pixel_centres():
         for column in (int(x), int(x) + 1):
             for row in (int(y), int(y) + 1):
                 slow[:, i] += (1 - abs(x - column)) * (1 - abs(y - row)) * image[:, :, row, column]
-    torch.testing.assert_close(look_up(image, uv), slow, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(LookUp(uv, 8)(image), slow, rtol=1e-4, atol=1e-5)
     half = torch.arange(256.0).expand(1, 1, 256, -1).bfloat16()  # whole numbers up to 256 are exact in it
-    torch.testing.assert_close(look_up(half, torch.tensor([[0.7013, 0.5]])).item(), 0.7013 * 256 - 0.5)
-    corner = look_up(image, torch.zeros(1, 2))  # beyond the outermost centres the image goes on as it ends
+    between = LookUp(torch.tensor([[0.7013, 0.5]]), 256)(half)
+    torch.testing.assert_close(between.item(), 0.7013 * 256 - 0.5)
+    corner = LookUp(torch.zeros(1, 2), 8)(image)  # beyond the outermost centres the image goes on as it ends
     torch.testing.assert_close(corner[:, 0], image[:, :, 0, 0])
+
+
+def test_look_up_and_its_gradient_are_those_of_grid_sample():
+    torch.manual_seed(0)
+    image, uv = torch.randn(2, 3, 8, 8, dtype=torch.float64, requires_grad=True), torch.rand(200, 2).double()
+    where = (2 * uv - 1).expand(2, 1, -1, -1)
+    slow = grid_sample(image, where, padding_mode="border", align_corners=False)[:, :, 0].transpose(1, 2)
+    fast = LookUp(uv, 8)(image)
+    torch.testing.assert_close(fast, slow)
+    gradient = torch.randn_like(slow)
+    for mine, theirs in zip(*(torch.autograd.grad(found, image, gradient) for found in (fast, slow))):
+        torch.testing.assert_close(mine, theirs)
+
+
+def test_points_of_other_samples_are_looked_up_anew():
+    atlas = Atlas(ATLASED, 8)
+    draws = (torch.Generator().manual_seed(seed) for seed in (0, 1))
+    first, second = (sample_surface(ATLASED.vertices, ATLASED.faces, 9, draw) for draw in draws)
+    image = torch.rand(1, 2, 8, 8)
+    expected = [LookUp(atlas.place(samples), 8)(image) for samples in (first, second)]
+    assert atlas.look_up_at(first) is atlas.look_up_at(replace(first))
+    for samples, features in zip((first, second, first), (*expected, expected[0])):
+        assert torch.equal(atlas.look_up_at(samples)(image), features)
 
 
 def test_features_jump_at_seams_where_closet_goes_on():

@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import batch_norm, conv2d, conv_transpose2d, interpolate, leaky_relu, relu
 
 from avatar.checks import AvatarError
-from avatar.nn.baselines.unet import UNet, UNetConfig
+from avatar.nn.baselines.unet import Doubling, UNet, UNetConfig
 
 
 def parameters(module: torch.nn.Module) -> int:
@@ -80,3 +80,15 @@ def test_bad_sizes_are_refused():
     for wrong in ({"levels": 2}, {"width": 0}, {"out_channels": 0}):
         with pytest.raises(AvatarError, match="levels, width, out_channels"):
             UNetConfig(**wrong)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (8, 4)])
+def test_doubling_and_its_gradient_are_those_of_interpolation(size):
+    image = torch.randn(2, 3, *size, dtype=torch.float64, requires_grad=True)
+    slow = interpolate(image, scale_factor=2, mode="bilinear", align_corners=False)
+    fast = Doubling()(image)
+    torch.testing.assert_close(fast, slow)
+    gradient = torch.randn_like(slow)
+    for mine, theirs in zip(*(torch.autograd.grad(found, image, gradient) for found in (fast, slow))):
+        torch.testing.assert_close(mine, theirs)
+    assert Doubling()(image.bfloat16()).dtype == torch.bfloat16

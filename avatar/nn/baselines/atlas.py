@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample
 
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.bags import Bags, sum_bags
 from avatar.geometry.uv import UVGrid, paint, rasterise_uv, sample_uv, uv_areas
 from avatar.records import SurfaceSamples, Template
 
@@ -42,6 +43,7 @@ class Atlas(nn.Module):
         }.items():
             self.register_buffer(name, value.clone(), persistent=False)
         self._asked: tuple[int, SurfaceSamples] | None = None
+        self._looked_up: tuple[Tensor, LookUp] | None = None
 
     @property
     def grid(self) -> UVGrid:
@@ -57,6 +59,12 @@ class Atlas(nn.Module):
         """UV coordinates ``(N, 2)`` of surface points."""
         return sample_uv(self.uv, self.uv_faces, samples)
 
+    def look_up_at(self, samples: SurfaceSamples) -> LookUp:
+        """The look-up in feature images of the map's size at surface points; made once for the same samples."""
+        if self._looked_up is None or self._looked_up[0] is not samples.barycentric:
+            self._looked_up = samples.barycentric, LookUp(self.place(samples), self.map_size)
+        return self._looked_up[1]
+
     def pixel_points(self, points: int) -> SurfaceSamples:
         """The surface under the pixels of the square grid that has nearest to ``points`` of them in the atlas.
 
@@ -69,16 +77,34 @@ class Atlas(nn.Module):
         return self._asked[1].to(self.uv.device)
 
 
-def look_up(features: Tensor, uv: Tensor) -> Tensor:
-    """Bilinear interpolation of feature images ``(B, C, S, S)`` at UV coordinates ``(N, 2)``, to ``(B, N, C)``.
+class LookUp:
+    """Bilinear interpolation of feature images at UV coordinates, in their precision: in half it would be pixels off.
 
-    In the coordinates' precision, whatever the network runs in: in half precision they are pixels off.
+    Beyond the outermost centres of pixels an image goes on as it ends. A weighted sum of four pixels a point, which is
+    faster than ``grid_sample`` and repeatable: the backward pass of that adds in an order of chance on CUDA.
     """
-    check_shape("features", features, "B C S S")
-    check_shape("uv", uv, "N 2")
-    where = (2 * uv - 1).expand(len(features), 1, -1, -1)
-    found = grid_sample(features.to(uv.dtype), where, padding_mode="border", align_corners=False)
-    return found[:, :, 0].transpose(1, 2)
+
+    def __init__(self, uv: Tensor, size: int):
+        """Prepares look-ups at coordinates ``(N, 2)`` in images of ``size`` pixels a side."""
+        check_shape("uv", uv, "N 2")
+        places = (uv * size - 0.5).clamp(0, size - 1)
+        low = places.floor().clamp(max=max(size - 2, 0))
+        columns, rows = torch.stack([low, (low + 1).clamp(max=size - 1)], dim=-1).long().unbind(dim=1)
+        across, down = torch.stack([1 - (places - low), places - low], dim=-1).unbind(dim=1)
+        ids = (rows[:, :, None] * size + columns[:, None]).flatten(1)
+        self.size = size
+        self.bags = Bags.of_table(ids, size**2, (down[:, :, None] * across[:, None]).flatten(1))
+
+    @cached_property
+    def back(self) -> Bags:
+        """The transposed sums, which the backward pass takes."""
+        return self.bags.transpose()
+
+    def __call__(self, features: Tensor) -> Tensor:
+        """Features ``(B, N, C)`` of images ``(B, C, S, S)``."""
+        check_shape("features", features, f"B C {self.size} {self.size}")
+        rows = features.to(self.bags.weights.dtype).flatten(2).transpose(1, 2)
+        return sum_bags(rows, self.bags, self.back if rows.requires_grad else None)
 
 
 def uv_and_patch(uv: Tensor, patch: Tensor, frames: int) -> Tensor:

@@ -10,9 +10,10 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.bags import pick
 from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions
-from avatar.nn.baselines.atlas import Atlas, look_up, uv_and_patch
+from avatar.nn.baselines.atlas import Atlas, uv_and_patch
 from avatar.nn.baselines.unet import UNet, UNetConfig
 from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, bare_body
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
@@ -90,9 +91,9 @@ class PopAvatar(nn.Module):
         """The points this network predicts when about ``points`` are asked for; None leaves them to the caller."""
         return self.atlas.pixel_points(points) if self.config.points is PointSource.grid else None
 
-    def garment_features(self, codes: Tensor, uv: Tensor) -> Tensor:
+    def garment_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
         """Garment features and place of each point: ``(O, C, S, S)`` codes to ``(O, N, C + 4)``."""
-        features = look_up(self.garment_encoder(codes), uv)
+        uv, features = self.atlas.place(samples), self.atlas.look_up_at(samples)(self.garment_encoder(codes))
         return torch.cat([features, uv_and_patch(uv, torch.zeros_like(uv), len(codes))], dim=-1)
 
     def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
@@ -111,15 +112,16 @@ class PopAvatar(nn.Module):
             raise AvatarError("wrinkles: a model without explicit garment template has nothing else to predict.")
         outfits = batch.outfits
         row = torch.searchsorted(outfits, batch.outfit_ids)
-        codes, uv = self.codes[outfits], self.atlas.place(samples)
-        garment = self.garment_features(codes, uv)
+        codes = pick(self.codes, outfits)
+        garment = self.garment_features(codes, samples)
         parts = []
         if self.config.template:
             decoded = self.garment_decoder(garment)
-            parts.append(Decoded(decoded.offsets[row], decoded.normals[row]))
+            parts.append(Decoded(pick(decoded.offsets, row), pick(decoded.normals, row)))
         if wrinkles:
-            pose = look_up(self.pose_encoder(self.atlas.position_map(batch.pose_vertices)), uv)
-            parts.append(self.pose_decoder(torch.cat([pose, garment[row]], dim=-1)))
+            image = self.pose_encoder(self.atlas.position_map(batch.pose_vertices))
+            pose = self.atlas.look_up_at(samples)(image)
+            parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1)))
         parts = [Decoded(part.offsets.float() * self.config.offset_scale, part.normals.float()) for part in parts]
         local = sum(parts, bare_body(self.skin_normals, samples, self.config.normals))
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
@@ -145,8 +147,7 @@ class PopAvatar(nn.Module):
         """
         if not self.config.template:
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")
-        uv = self.atlas.place(samples)
-        decoded = self.garment_decoder(self.garment_features(self.codes[outfit : outfit + 1], uv))
+        decoded = self.garment_decoder(self.garment_features(self.codes[outfit : outfit + 1], samples))
         dressed = bare_body(self.skin_normals, samples, self.config.normals) + decoded
         points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
         return Decoded(points, normalize(dressed.normals, dim=-1))

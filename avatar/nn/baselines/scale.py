@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.bags import Bags, sum_bags
 from avatar.geometry.neighbours import nearest
 from avatar.geometry.sampling import farthest_points
 from avatar.geometry.surface import interpolate
@@ -148,8 +149,8 @@ class ScaleAvatar(nn.Module):
     def pose_features(self, pose_vertices: Tensor) -> Tensor:
         """What each patch knows of the pose: ``(B, V, 3)`` posed body to ``(B, P, C)``."""
         if self.config.pose_feature is PoseFeature.local:
-            features = self.pose_encoder(self.atlas.position_map(pose_vertices)).flatten(2)
-            return features[..., self.patch_pixels].transpose(1, 2)
+            features = self.pose_encoder(self.atlas.position_map(pose_vertices)).flatten(2).transpose(1, 2)
+            return sum_bags(features, Bags.of_table(self.patch_pixels[:, None], features.shape[1]))
         centres = interpolate(pose_vertices, self.patches)
         return self.pose_encoder(centres)[:, None].expand(-1, centres.shape[1], -1)
 
@@ -182,7 +183,8 @@ class ScaleAvatar(nn.Module):
         patch = self.patch_of_pixel[pixels[:, 1] * size + pixels[:, 0]]
         corners = self.patch_corners[patch]
         place = uv_and_patch((corners + 0.5) / size, spots - corners, len(batch.vertices))
-        features = self.pose_features(batch.pose_vertices)[:, patch]
+        features = self.pose_features(batch.pose_vertices)
+        features = sum_bags(features, Bags.of_table(patch[:, None], features.shape[1]))
         local = self.decoder(torch.cat([features.to(place.dtype), place], dim=-1))
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
             frames = self.patch_frames(batch.vertices)[:, patch]

@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avatar.export.rival_search import open3d_nearest
-from avatar.geometry.distances import correspond, gather_points, normal_difference, point_to_point
+from avatar.geometry.bags import gather_rows
+from avatar.geometry.distances import correspond, normal_difference, point_to_point
 from avatar.geometry.neighbours import nearest
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.pipeline.benchmarks.avatars import sample_outfit
@@ -96,9 +97,9 @@ def chamfer_races(job: Job) -> list[Race]:
 
         def run() -> np.ndarray:
             pairs = correspond(cloud, scan)
-            there = point_to_point(cloud, gather_points(scan, pairs.scan_of_point)).mean()
-            back = point_to_point(scan, gather_points(cloud, pairs.point_of_scan)).mean()
-            turned = normal_difference(normals, gather_points(scan_normals, pairs.scan_of_point)).mean()
+            there = point_to_point(cloud, gather_rows(scan, pairs.scan_of_point)).mean()
+            back = point_to_point(scan, gather_rows(cloud, pairs.point_of_scan)).mean()
+            turned = normal_difference(normals, gather_rows(scan_normals, pairs.scan_of_point)).mean()
             return torch.stack([there, back, turned]).cpu().numpy()
 
         return run
