@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import os
 import pickle
 import re
@@ -10,6 +11,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -36,13 +38,17 @@ TABLE = [f"runs/{name}/sample/dress/table" for name in ("static", "closet")]
 # What stands for a placeholder, the first that fits; several values make several commands.
 FILLED = {
     "[<run>,<run>,<folder>]": [f"[{FIRST},{FIRST.replace('closet', 'static')},theirs]"],
+    "[<run>]": [f"[{FIRST}]"],
     "[<run>,<run>]": [f"[{POP},{CLOSET}]"],
     "[<run of pop>,<run of closet>]": [f"[{POP},{CLOSET}]"],
     "[<pop>,<csf>,<closet>]": [f"[{POP},{CSF},{CLOSET}]"],
     "[<static run>,<closet run>]": [f"[{','.join(TABLE)}]"],
     "<run of several outfits>": ["runs/closet/open/tee+shirt/default"],
+    "<run folder of several outfits>": ["runs/closet/open/tee+shirt/default"],
     "<new>": ["skirt"],
+    "<new outfit>": ["skirt"],
     "<run>": [FIRST],
+    "<run folder>": [FIRST],
     "<motion>": ["walk"],
     "<folder>": ["theirs"],
     "<name>": ["csf"],
@@ -81,19 +87,18 @@ SHORT = {
         *(f"canonicalizer.{option}" for option in CANONICALIZER),
     ),
     "bench": ("quick=true", "repeats=1", "memory=false"),
-    "torture": (
-        *(
-            "kills=1",
-            "kills_in_saves=1",
-            "flips=5",
-            "truncations=3",
-            "files=20",
-            "names=3",
-            "full_disks=1",
-            "poisons=1",
-        ),
-        *("races=1", "meshes=3", "demo_minutes=0.02", "stream_gb=0.05", "stream_frames=3"),
-    ),
+    "torture": ("only=[fuzz]", "files=50"),
+}
+
+# And fewer jobs of an experiment: test_configs.py composes them all.
+FEWER = {
+    "closet1": ("method=pop,closet", "outfit=[tee,skirt]"),
+    "closet3": ("method=pop,closet", "outfit=jacket"),
+    "closet4": ("method=scale_global,csf,closet_pointnext", "outfit=jacket"),
+    "fractions": ("method=static", "split.train_fraction=1.0,0.5"),
+    "loose": ("method=closet,closet_learned",),
+    "scanimate1": ("outfit=tee", "canonicalizer.weights=learned,knn"),
+    "scanimate2": ("method=scanimate_global", "split.train_fraction=1.0,0.5"),
 }
 
 # What a verb promises to leave, with its options filled in.
@@ -123,7 +128,7 @@ USUAL = {"dataset": "sample", "outfit": "dress", "name": "default", "method": "c
 
 @dataclass(frozen=True)
 class Printed:
-    """A command line as some documents print it; ``block`` is the fenced block or the line that it stands in."""
+    """A command line as a document prints it; ``block`` is the fenced block or the line that it stands in."""
 
     text: str
     block: str
@@ -209,7 +214,8 @@ def verb_of(text: str) -> str:
 
 def shortened(text: str) -> str:
     """A command with the options of its verb that make less work, in place of those printed."""
-    options = SHORT.get(verb_of(text), ())
+    named = re.search(r" experiment=(\w+)", text)
+    options = [*SHORT.get(verb_of(text), ()), *FEWER.get(named.group(1) if named else "", ())]
     if text.startswith("torchrun"):  # a whole number of frames a process
         options = [option.replace("train.batch=1", "train.batch=4") for option in options]
     keys = {option.partition("=")[0] for option in options}
@@ -242,22 +248,60 @@ def promised_files(text: str) -> list[str]:
     return list(dict.fromkeys(globs))
 
 
-def run_command(text: str, folder: Path, program: Path, timeout: float = 600) -> Outcome:
-    """Runs a command in a folder, with the program elsewhere and no terminal."""
+def run_command(
+    text: str, folder: Path, program: Path, starter: Starter | None = None, timeout: float = 300
+) -> Outcome:
+    """Runs a command in a folder, with the program elsewhere and no terminal; by a `Starter` it is begun faster."""
     words = shlex.split(text)
     settings = [words.pop(0) for _ in range(len(words)) if re.match(r"[A-Z_]+=", words[0])]
-    words[0] = str(Path(sys.executable).with_name(words[0]))
     words = [str(program / word) if word.startswith("tools/") else word for word in words]
-    kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST", "COV"))}
-    environment = kept | {"PYTHONPATH": str(program), "OMP_NUM_THREADS": "1"} | dict(s.split("=", 1) for s in settings)
     started = time.monotonic()
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    try:
-        done = subprocess.run(words, cwd=folder, env=environment, text=True, check=False, timeout=timeout, **pipes)
-    except subprocess.TimeoutExpired as error:
-        return Outcome(-1, f"no end in {timeout:.0f} s; {error.stdout}", timeout)
-    missing = [glob for glob in promised_files(text) if not any(p.stat().st_size for p in folder.glob(glob))]
-    return Outcome(done.returncode, done.stdout, time.monotonic() - started, missing)
+    descriptor, name = tempfile.mkstemp()
+    os.close(descriptor)
+    output = Path(name)
+    if starter and words[0] == "python" and not settings:
+        code = starter.run(words[1:], folder, output, timeout)
+    else:
+        words[0] = str(Path(sys.executable).with_name(words[0]))
+        environment = environment_of(program) | dict(setting.split("=", 1) for setting in settings)
+        with output.open("w") as target:
+            pipes = {"stdin": subprocess.DEVNULL, "stdout": target, "stderr": subprocess.STDOUT}
+            try:
+                code = subprocess.run(
+                    words, cwd=folder, env=environment, check=False, timeout=timeout, **pipes
+                ).returncode
+            except subprocess.TimeoutExpired:
+                code = -1
+    missing = [glob for glob in promised_files(text) if not any(path.stat().st_size for path in folder.glob(glob))]
+    outcome = Outcome(code, output.read_text(errors="replace"), time.monotonic() - started, missing)
+    output.unlink()
+    return outcome
+
+
+def environment_of(program: Path) -> dict[str, str]:
+    """The environment of a command: one thread, this copy of the program, nothing of the test runner's."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST", "COV"))}
+    return kept | {"PYTHONPATH": str(program), "OMP_NUM_THREADS": "1"}
+
+
+class Starter:
+    """A process that has imported the program and starts commands as processes of their own (`starter.py`)."""
+
+    def __init__(self, program: Path):
+        command = [sys.executable, str(Path(__file__).with_name("starter.py"))]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        self.process = subprocess.Popen(command, env=environment_of(program), text=True, **pipes)
+
+    def run(self, words: list[str], folder: Path, output: Path, timeout: float) -> int:
+        """The exit code of a command whose output goes to a file."""
+        request = {"words": words, "folder": str(folder), "output": str(output), "timeout": timeout}
+        print(json.dumps(request), file=self.process.stdin, flush=True)
+        return int(self.process.stdout.readline())
+
+    def close(self) -> None:
+        """Ends the process."""
+        self.process.stdin.close()
+        self.process.wait(10)
 
 
 def copy_program(folder: Path) -> Path:
