@@ -1,7 +1,10 @@
 """Packed outfits of one's own body: what ``outfit.yaml`` may say, poses with and without hands, mean shapes."""
 
 import dataclasses
+import runpy
 import shutil
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +19,10 @@ from avatar.body.registry import canonical_pose
 from avatar.checks import DataError
 from avatar.data.layouts import open_outfit_folder
 from avatar.data.open_layout import OpenOutfit
-from avatar.data.packed_layout import PackedOutfit, write_packed_outfit
+from avatar.data.packed_layout import PackedOutfit
 
 POSE = tiny_pose(0.5)
+TOOLS = Path(__file__).parents[2] / "tools"
 
 
 @pytest.fixture
@@ -105,7 +109,7 @@ def test_what_outfit_yaml_says_of_a_body_is_checked(folder, body, message):
         _ = say(folder, body=body).template
 
 
-def test_packing_keeps_the_canonical_pose(tiny_folder, tmp_path):
+def test_the_pack_command_keeps_the_canonical_pose(tiny_folder, tmp_path, monkeypatch, capsys):
     """Frames are relative to it: legs apart at rest must not become the T-pose."""
     shutil.copytree(tiny_folder, tmp_path / "open" / "tiny")
     shutil.rmtree(tmp_path / "open" / "tiny" / "test")
@@ -114,7 +118,10 @@ def test_packing_keeps_the_canonical_pose(tiny_folder, tmp_path):
     text = (tmp_path / "open" / "tiny" / "outfit.yaml").read_text()
     (tmp_path / "open" / "tiny" / "outfit.yaml").write_text(text.replace("canonical: t", "canonical: apart"))
     outfit = OpenOutfit(tmp_path / "open" / "tiny")
-    packed = write_packed_outfit(outfit, tmp_path / "packed" / "tiny")
+    monkeypatch.setattr(sys, "argv", ["pack.py", str(outfit.path), str(tmp_path / "packed" / "tiny")])
+    runpy.run_path(str(TOOLS / "pack.py"), run_name="__main__")
+    assert "1 frames. Train on them: python tools/train.py dataset=packed outfit=tiny" in capsys.readouterr().out
+    packed = PackedOutfit(tmp_path / "packed" / "tiny")
     apart = canonical_pose("apart", outfit.body.joint_names)
     torch.testing.assert_close(packed.body.canonical_pose, apart)
     ours, theirs = (o.load("train", "rise.00000").body for o in (outfit, packed))

@@ -1,7 +1,10 @@
 """Motion files: AMASS, our own, BVH; conventions, resampling and broken files."""
 
 import logging
+import runpy
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -299,3 +302,14 @@ def test_bvh_is_fitted_to_the_body_that_moves(tmp_path, walk):
     read = read_motion(path, rest=1.5 * rest + [0, 0.4, 0])
     pelvis = 1.5 * (walk.translations + rest[0])
     np.testing.assert_allclose(read.translations + 1.5 * rest[0] + [0, 0.4, 0], pelvis, atol=1e-5)
+
+
+def test_the_open_motions_come_from_a_command(tmp_path, monkeypatch, capsys):
+    tool = str(Path(__file__).parents[2] / "tools" / "make_motion.py")
+    monkeypatch.setattr(sys, "argv", [tool, "squat", str(tmp_path / "squat.npz"), "--seconds", "0.5"])
+    runpy.run_path(tool, run_name="__main__")
+    assert "15 frames" in capsys.readouterr().out
+    np.testing.assert_array_equal(read_motion(tmp_path / "squat.npz").poses, authored_motion("squat", 30, 0.5).poses)
+    monkeypatch.setattr(sys, "argv", [tool, "fly", str(tmp_path / "fly.npz")])
+    with pytest.raises(SystemExit, match="expected one of walk"):
+        runpy.run_path(tool, run_name="__main__")
