@@ -5,7 +5,6 @@ The standard library alone, for what it prints is needed most where nothing else
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
 import re
 import shlex
@@ -67,9 +66,11 @@ def install_line(package: str) -> str:
 
 def requirements(extra: str = "") -> list[str]:
     """What the installed distribution requires for one of its extras, or for none of them; empty if not installed."""
+    from importlib.metadata import PackageNotFoundError, requires  # slow to import, and rarely needed
+
     try:
-        lines = importlib.metadata.requires(DISTRIBUTION) or []
-    except importlib.metadata.PackageNotFoundError:
+        lines = requires(DISTRIBUTION) or []
+    except PackageNotFoundError:
         return []
     marker = re.compile(r"""\s*(?:;|\band\b)\s*extra\s*==\s*["']([\w-]+)["']""")
     found = [(marker.search(line), line) for line in lines]
