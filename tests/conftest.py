@@ -7,6 +7,7 @@ from tiny import write_tiny_outfit
 
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.scanner import ScanConfig
+from avatar.io import ledger
 
 CHROMIUM_FLAGS = (
     "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync "
@@ -38,3 +39,20 @@ def browser():
         chromium = playwright.chromium.launch(executable_path=executable, args=CHROMIUM_FLAGS.split())
         yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def change_source(monkeypatch):
+    """Lets the ledger take the code of a module for another version of it, for the length of a test."""
+
+    def change(module: str) -> None:
+        monkeypatch.setitem(ledger.SOURCES, module, ledger.SOURCES[module] + b"\nCHANGED = True\n")
+        forget()
+
+    def forget() -> None:
+        ledger.source_digest.cache_clear()
+        ledger.module_digest.cache_clear()
+
+    yield change
+    monkeypatch.undo()
+    forget()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,9 @@ from avatar.evaluation.scores import Score, Scores, read_scores, write_scores
 from avatar.evaluation.tables import Table, View, outfit_table, to_latex, to_markdown
 from avatar.io.npz import write_whole
 from avatar.pipeline.pose_grid import draw_pose_grid
-from avatar.pipeline.scores import read_all_scores, scores_file
+from avatar.pipeline.scores import are_current, read_all_scores, read_floors, scores_file
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -113,6 +116,9 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
         AvatarError: when there are none, or outfits of one name come from several data sets.
     """
     scores, homes = Scores(), {}
+    files = [scores_file(run, split) for run in runs for split in config.splits]
+    if old := [str(path) for path in files if path.is_file() and not are_current(path)]:
+        log.warning("compare: scored by other code than today's, or edited: %s. Score them again.", ", ".join(old))
     for run in runs:
         mine = read_all_scores(scores_file(run, split) for split in config.splits)
         for row in mine.rows:
@@ -128,8 +134,7 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
         )
     floors = Scores()
     for outfit, (dataset,) in sorted(homes.items()):
-        path = config.runs_root / "floors" / dataset / outfit / "scores.csv"
-        floors = floors + (read_scores(path) if path.is_file() else Scores())
+        floors = floors + read_floors(config.runs_root, dataset, outfit, scores.rows)
     whole = floors + scores
     return Scores([replace(row, table=config.table) for row in whole.rows], whole.frames)
 

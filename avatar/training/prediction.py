@@ -21,6 +21,7 @@ from avatar.records import Batch, BodyFit, Motion, PointCloud, Prediction, Surfa
 from avatar.settings import settings_to_dict
 from avatar.training.runs import TrainedAvatar
 
+SOURCE = ("avatar.training.prediction",)  # what makes predictions, networks and readers of data included
 MAX_POINTS = 400_000
 CHUNK = 100_000  # points decoded at once, or fewer where memory runs out; the network is pointwise
 
@@ -103,7 +104,7 @@ def predict_frames(
     written, done, made_by = [], Ledger(folder), avatar_digest(avatar)
     for name in tqdm([n for n in outfit.frames(split) if keep(n)], desc=f"predict {outfit.name}", disable=None):
         written.append(folder / f"{name}.ply")
-        key = keyed(avatar=made_by, points=points, body=outfit.digest(split, name))
+        key = keyed(SOURCE, avatar=made_by, points=points, body=outfit.digest(split, name))
         if not done.find(name, key):
             batch = body_batch([outfit.load(split, name).body], index, (name,))
             write_points(written[-1], predict(avatar.model, batch, samples))
@@ -144,7 +145,7 @@ def predict_motion(avatar: TrainedAvatar, outfit: OpenOutfit, motion: Motion, fo
     for frame in tqdm(range(len(motion.poses)), desc=f"predict {motion.name}", disable=None):
         name = f"{motion.name}.{frame:05d}"
         written.append(folder / f"{name}.ply")
-        key = keyed(avatar=made_by, points=points, body=pose_digest(outfit, motion, frame))
+        key = keyed(SOURCE, avatar=made_by, points=points, body=pose_digest(outfit, motion, frame))
         if not done.find(name, key):
             body = outfit.fit_pose(motion.poses[frame], motion.translations[frame])
             write_points(written[-1], predict(avatar.model, body_batch([body], index, (name,)), samples))

@@ -15,6 +15,7 @@ from tiny import SETTINGS, quick_training
 from avatar.checks import AvatarError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
+from avatar.evaluation import scoring
 from avatar.evaluation.forms import Axis, FormConfig, ReportedTable
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
@@ -78,18 +79,28 @@ def test_a_job_leaves_predictions_and_scores_with_what_tells_it_apart(jobs):
     }
 
 
-def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs):
-    run = jobs[1].run.folder
-    (run / "predictions" / "test" / "tiny" / "check.00000.ply").unlink()
-    weights, scores = (run / "avatar.safetensors").read_bytes(), (run / "scores.csv").stat().st_mtime_ns
-    experiment(jobs[1])
-    assert (run / "avatar.safetensors").read_bytes() == weights
-    assert (run / "scores.csv").stat().st_mtime_ns == scores
-    assert not (run / "predictions" / "test" / "tiny" / "check.00000.ply").is_file()
-    experiment(replace(jobs[1], score=replace(jobs[1].score, seed=5)))
-    assert (run / "scores.csv").stat().st_mtime_ns > scores
-    assert (run / "predictions" / "test" / "tiny" / "check.00000.ply").is_file()
-    experiment(jobs[1])
+def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatch, change_source):
+    run, drawn, real = jobs[1].run.folder, [], scoring.draw_scan
+    monkeypatch.setattr(scoring, "draw_scan", lambda frame, config: drawn.append(frame.name) or real(frame, config))
+    (run / "scored.txt").write_text("of an older version: not believed")
+
+    def again(job: ExperimentConfig) -> int:
+        """How many predictions the job scores."""
+        drawn.clear()
+        experiment(job)
+        return len(drawn)
+
+    cloud = run / "predictions" / "test" / "tiny" / "check.00000.ply"
+    before = {path: path.read_bytes() for path in (cloud, run / "avatar.safetensors", run / "scores.csv")}
+    cloud.unlink()
+    assert again(jobs[1]) == 0
+    assert before == {path: path.read_bytes() for path in before}
+    other = replace(jobs[1], score=replace(jobs[1].score, seed=5))
+    assert again(other) == 3 and (run / "scores.csv").read_bytes() != before[run / "scores.csv"]
+    assert again(jobs[1]) == 0
+    change_source("avatar.evaluation.closest")
+    assert again(jobs[1]) == 3 and again(jobs[1]) == 0
+    assert before == {path: path.read_bytes() for path in before}
 
 
 def test_the_table_has_every_form(jobs):
