@@ -14,12 +14,14 @@ import re
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -34,6 +36,7 @@ from avatar.pipeline.demo import DemoConfig
 from avatar.pipeline.experiments import ExperimentConfig
 from avatar.pipeline.methods import SETTINGS
 from avatar.pipeline.outcomes import State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
+from avatar.pipeline.parameters import ParametersConfig
 from avatar.pipeline.reporting import ReportConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig
 from avatar.pipeline.seams import SeamsConfig
@@ -64,6 +67,7 @@ VERBS = {
     "simulate": SimulateConfig,
     "torture": TortureConfig,
     "bench": BenchConfig,
+    "parameters": ParametersConfig,
 }
 Settings = TypeVar("Settings")
 
@@ -84,9 +88,10 @@ def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
 
 
 def compose_settings(verb: str, *overrides: str) -> Any:
-    """A verb's settings as the command line would give them with these overrides."""
+    """A verb's settings as the command line would give them with these overrides; within a verb's run as well."""
     register()
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+    running = GlobalHydra.instance().is_initialized()
+    with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         return to_settings(VERBS[verb], hydra.compose(verb, list(overrides)))
 
 

@@ -2,8 +2,11 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -26,6 +29,24 @@ def test_every_verb_composes_and_has_its_tool(verb):
     assert type(load(verb)) is VERBS[verb]
     assert (ROOT / "tools" / f"{verb}.py").is_file()
     assert (CONF / f"{verb}.yaml").read_text().startswith(f"# python tools/{verb}.py")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_writes_below_the_roots_of_runs_and_data_unless_told_otherwise(verb):
+    """Trying something must not overwrite the published tables, nor anything else of the folder it is tried in."""
+    assert [(name, str(path)) for name, path in paths_of(load(verb)) if path.parts[0] not in ("runs", "data")] == []
+
+
+def paths_of(settings: Any, prefix: str = "") -> Iterator[tuple[str, Path]]:
+    """Every path among a verb's settings, by the name of its option."""
+    for field in fields(settings):
+        value, name = getattr(settings, field.name), f"{prefix}{field.name}"
+        if is_dataclass(value):
+            yield from paths_of(value, f"{name}.")
+        elif isinstance(value, Path) or field.name == "root":
+            yield name, Path(value)
+        elif isinstance(value, tuple):
+            yield from ((name, item) for item in value if isinstance(item, Path))
 
 
 @pytest.mark.parametrize("method", METHODS)

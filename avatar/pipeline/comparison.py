@@ -47,7 +47,7 @@ class CompareConfig:
     pictures: int = 3  # unseen poses an outfit in the picture of all methods; 0 for none
     splits: tuple[str, ...] = ("test",)  # that were scored; the first is the picture's
     data_root: Path | None = None  # where the data are now; where they were at training if null
-    out: Path = Path("docs/results")
+    out: Path | None = None  # where the table's files go; <runs_root>/tables if null
 
     def __post_init__(self):
         check_name("table", self.table)
@@ -60,7 +60,7 @@ class CompareConfig:
 
 
 def compare(config: CompareConfig) -> Path:
-    """Writes ``<out>/<table>.*``; gives the path of the Markdown.
+    """Writes ``<out>/<table>.*``, which it prints; gives the path of the Markdown.
 
     ``.csv`` and ``.frames.csv`` hold the tidy scores, ``.md`` and ``.tex`` the tables, ``.differences.csv`` those to
     the baseline, ``.<plot>.png`` the plots, ``.poses.jpg`` the same unseen poses by all methods. Canonicalizers can be
@@ -76,7 +76,7 @@ def compare(config: CompareConfig) -> Path:
     text = "\n".join([*map(to_markdown, tables), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
     write_whole(file_of(config, "md"), text.encode())
     write_whole(file_of(config, "tex"), "\n".join(map(to_latex, tables)).encode())
-    print(text)
+    print(f"{text}\nwritten: {file_of(config, '*')}")
     return file_of(config, "md")
 
 
@@ -98,7 +98,7 @@ def compare_runs(config: CompareConfig, runs: tuple[Path, ...]) -> tuple[list[Ta
 
 def file_of(config: CompareConfig, suffix: str) -> Path:
     """One of the table's files."""
-    return config.out / f"{config.table}.{suffix}"
+    return (config.out or config.runs_root / "tables") / f"{config.table}.{suffix}"
 
 
 def named_runs(config: CompareConfig) -> Iterator[Path]:

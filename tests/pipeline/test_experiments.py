@@ -53,7 +53,6 @@ def first(tiny_folder, tmp_path_factory) -> ExperimentConfig:
             baseline="static",
             reported=ReportedTable("a paper, table 9", ("POP",), {"CD": (7.34,)}),
             pictures=2,
-            out=folder / "results",
         ),
     )
 
@@ -104,7 +103,7 @@ def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatc
 
 
 def test_the_table_has_every_form(jobs):
-    out = jobs[0].compare.out
+    out = jobs[0].runs_root / "tables"
     text = tabulate_experiment(jobs).read_text()
     assert "| metric | sampling | body | static | closet | closet (50%) |" in text
     assert "Equal steps: 4 each." in text and "Reported: a paper, table 9" in text and "excess over the" in text
@@ -179,13 +178,18 @@ def test_one_command_runs_all_jobs_names_the_failure_and_tables_the_rest(tiny_fo
         frame.write_bytes(frame.read_bytes()[:1000])
     options = "experiment=closet5 dataset=open outfit=one,two method=static train.steps=2 train.points=500 points=1000"
     options += " train.scan_points=500 train.batch=1 train.mirror=false score.scan_points=500 compare.baseline=static"
-    options += " compare.metrics=[cd_point] compare.pictures=0 compare.plots=false compare.out=out"
+    options += " compare.metrics=[cd_point] compare.pictures=0 compare.plots=false"
     line = [sys.executable, str(ROOT / "tools/experiment.py"), *options.split()]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    published = {path: path.stat().st_mtime_ns for path in (ROOT / "docs").rglob("*")}
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 2, done.stderr
     assert "2 jobs: 1 finished, 1 failed." in done.stderr and "Traceback" not in done.stderr
     failed = [line for line in done.stderr.splitlines() if line.startswith("  failed: ")]
     assert len(failed) == 1 and "outfit=two" in failed[0] and ".npz" in failed[0]
-    assert {row.method for row in read_scores(tmp_path / "out/closet5.csv").rows} == {"sampling", "body", "static"}
-    assert "Reported: CloSET, table 5" in (tmp_path / "out/closet5.md").read_text()
+    tables = tmp_path / "runs" / "tables"
+    assert {row.method for row in read_scores(tables / "closet5.csv").rows} == {"sampling", "body", "static"}
+    assert "Reported: CloSET, table 5" in (tables / "closet5.md").read_text()
+    assert "written: runs/tables/closet5.*" in done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == {"data", "runs"}
+    assert published == {path: path.stat().st_mtime_ns for path in published}  # not what this checkout publishes
