@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from collections import Counter
 from collections.abc import Iterable
@@ -19,13 +20,17 @@ from avatar.evaluation.scores import Score, Scores, frames_path, read_scores, wr
 from avatar.evaluation.scoring import SOURCE, Label, ScoreConfig, remember_scores, score_predictions
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
 from avatar.implicit.extraction import ExtractionConfig
+from avatar.io.documents import read_json
 from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.io.motions import read_motion
+from avatar.io.npz import write_whole
 from avatar.pipeline.methods import is_implicit, load_avatar
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
 from avatar.training.locks import lock_folder
 from avatar.training.prediction import predict_frames, predict_motion
 from avatar.training.runs import RunConfig, TrainedAvatar
+
+MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
 
 
 @dataclass
@@ -110,10 +115,19 @@ def predict(config: PredictConfig) -> list[Path]:
         if is_implicit(avatar):
             meshes = meshes_folder(config.run, motion.name, outfit.name)
             options = {"points": config.points, "config": config.surface}
-            predict_implicit_motion(avatar, outfit, motion, folders[-1], meshes, **options)
+            written = predict_implicit_motion(avatar, outfit, motion, folders[-1], meshes, **options)
         else:
-            predict_motion(avatar, outfit, motion, folders[-1], config.points)
+            written = predict_motion(avatar, outfit, motion, folders[-1], config.points)
+        for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
+            path.unlink()  # the end of an earlier prediction with more frames a second
+        write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
     return folders
+
+
+def predicted_fps(folder: Path) -> float:
+    """The frames a second that a motion was predicted at; 30 for the frames of a split."""
+    path = folder / MOTION
+    return float(read_json(path)["fps"]) if path.is_file() else 30.0
 
 
 def evaluate(config: EvaluateConfig) -> Scores:
@@ -131,7 +145,7 @@ def evaluate(config: EvaluateConfig) -> Scores:
 def score_foreign(config: EvaluateConfig, folder: Path) -> Scores:
     """Scores a foreign program's folder of predictions, and its floors at as many points."""
     if not folder.is_dir():
-        raise DataError(folder, "there is no such folder of predictions.")
+        raise DataError(folder, "there is no such folder of predictions.", "Run tools/predict.py first.")
     outfit = find_outfit(config.data_root or Path("data"), config.dataset, config.outfit)
     out = config.out or folder
     with lock_folder(out, wait=True):

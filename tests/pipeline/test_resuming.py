@@ -28,7 +28,7 @@ from avatar.pipeline.scores import (
     predict,
 )
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
-from avatar.pipeline.torture.miniature import folder_of, prepare, train_job
+from avatar.pipeline.torture.miniature import folder_of, train_job
 from avatar.settings import settings_from_dict
 from avatar.training import prediction
 from avatar.training.checkpoints import save_checkpoint
@@ -36,13 +36,6 @@ from avatar.training.runs import RunConfig, load_run
 
 ROOT = Path(__file__).parents[2]
 METRICS = ["cd_point", "normal_l1"]
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("resuming")
-    prepare(root)
-    return train_job("closet", root)
 
 
 @pytest.fixture
@@ -131,7 +124,7 @@ def test_scores_are_made_again_when_a_metric_or_a_prediction_changes_and_not_els
     after = {(row.method, row.metric): row.value for row in evaluate(config).rows}
     assert after == {key: value * (2 if key[1] == "cd_point" else 1) for key, value in before.items()}
     assert after["closet", "cd_point"] in {row.value for row in read_scores(run / "scores.csv").rows}
-    cloud = min((run / "predictions").rglob("*.ply"))
+    cloud = min((run / "predictions" / "test").rglob("*.ply"))
     points = read_points(cloud)
     write_points(cloud, replace(points, points=points.points + np.float32(0.01)))
     assert again() == (1, 0)
