@@ -14,12 +14,14 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
@@ -66,9 +68,10 @@ def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
 
 
 def compose_settings(verb: str, *overrides: str) -> Any:
-    """A verb's settings as the command line would give them with these overrides."""
+    """A verb's settings as the command line would give them with these overrides; within a verb's run as well."""
     register(verb)
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+    running = GlobalHydra.instance().is_initialized()
+    with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         return to_settings(settings_class(verb), hydra.compose(verb, list(overrides)))
 
 

@@ -1,4 +1,4 @@
-"""Verbs with a few arguments of their own and no settings: `doctor`, `convert_body`, `make_body` and `parameters`."""
+"""Small verbs: those that read a few arguments of their own instead of settings, and the count of parameters."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ import sys
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from avatar.cli import refuse
+from avatar.invocation import command_line
+
+if TYPE_CHECKING:
+    from avatar.pipeline.parameters import ParametersConfig
 
 
 def parser_of(verb: Callable[[], None]) -> argparse.ArgumentParser:
@@ -81,17 +86,67 @@ def make_body() -> None:
     print(f"{target}: {len(body.template.vertices):,} vertices, {height:.2f} m tall")
 
 
-def parameters() -> None:
-    """Counts every method's parameters at both sizes: writes docs/results/parameters.csv and .md."""
+def make_motion() -> None:
+    """Writes one of the open dataset's motions as a file for predict motion=...
+
+    make_motion walk walk.npz
+    make_motion dance data/motions/dance.npz --seconds 10 --fps 60
+    """
+    parser = parser_of(make_motion)
+    parser.add_argument("name", help="walk, squat, twist, reach, kick, bend or dance")
+    parser.add_argument("target", type=Path, help="the .npz to write")
+    parser.add_argument("--seconds", type=float, default=6.0)
+    parser.add_argument("--fps", type=float, default=30.0)
+    options = parser.parse_args()
+
+    from avatar.checks import AvatarError
+    from avatar.io.motions import write_motion
+    from avatar.simulate.sequences import authored_motion
+
+    try:
+        motion = authored_motion(options.name, options.fps, options.seconds)
+        write_motion(options.target, motion)
+    except AvatarError as error:
+        sys.exit(refuse("make_motion", error))
+    print(f"{options.target}: {len(motion.poses)} frames, {options.fps:g} a second")
+
+
+def pack() -> None:
+    """Writes an outfit of any layout as packed frames, which the programs of the POP line read as well (docs/data.md).
+
+    pack data/open/tee data/packed/tee
+    pack avatar/assets/sample/dress data/packed/dress
+    """
+    parser = parser_of(pack)
+    parser.add_argument("source", type=Path, help="the outfit's folder")
+    parser.add_argument("target", type=Path, help="the folder to write")
+    paths = parser.parse_args()
+
+    from avatar.checks import AvatarError
+    from avatar.data.layouts import open_outfit_folder
+    from avatar.data.packed_layout import write_packed_outfit
+
+    try:
+        packed = write_packed_outfit(open_outfit_folder(paths.source), paths.target)
+    except AvatarError as error:
+        sys.exit(refuse("pack", error))
+    count = sum(len(packed.frames(split)) for split in ("train", "test") if packed.has_frames(split))
+    where = {"dataset": paths.target.parent.name, "outfit": paths.target.name, "data_root": paths.target.parent.parent}
+    print(f"{paths.target}: {count} frames")
+    print(f"next: {command_line('train', *(f'{option}={value}' for option, value in where.items()))}")
+
+
+def parameters(config: ParametersConfig) -> list[Path]:
+    """Counts every method's parameters at both sizes: writes ``<out>/parameters.csv`` and ``parameters.md``."""
     from avatar.body.open import open_body
     from avatar.config import CONF, compose_settings
     from avatar.pipeline.parameters import write_parameters
 
-    parser_of(parameters).parse_args()
     methods = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
     choices = {
         (method, size): compose_settings("train", f"method={method}", f"size={size}").method
         for size in ("full", "small")
         for method in methods
     }
-    print(write_parameters(Path("docs/results"), choices, open_body("female").template))
+    print(write_parameters(config.out, choices, open_body("female").template))
+    return [config.out / f"parameters.{kind}" for kind in ("csv", "md")]

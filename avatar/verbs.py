@@ -91,9 +91,15 @@ VERBS = {
         "avatar.pipeline.torture.trials:torture",
         "avatar.pipeline.torture.trials:TortureConfig",
     ),
-    "parameters": Verb("counts every method's parameters", "avatar.plain_verbs:parameters"),
+    "parameters": Verb(
+        "counts every method's parameters",
+        "avatar.plain_verbs:parameters",
+        "avatar.pipeline.parameters:ParametersConfig",
+    ),
     "convert_body": Verb("converts an SMPL, SMPL-H or SMPL-X file", "avatar.plain_verbs:convert_body"),
     "make_body": Verb("makes a body of any shape", "avatar.plain_verbs:make_body"),
+    "make_motion": Verb("writes one of the open dataset's motions as a file", "avatar.plain_verbs:make_motion"),
+    "pack": Verb("writes an outfit as packed frames, as POP's line stores them", "avatar.plain_verbs:pack"),
     "doctor": Verb("lists what is installed and what is missing", "avatar.plain_verbs:doctor"),
 }
 

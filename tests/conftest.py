@@ -10,6 +10,7 @@ from tiny import write_tiny_outfit
 from avatar.body.convert import convert_body_model
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.scanner import ScanConfig
+from avatar.io import ledger
 
 pretended.install()  # before any backward pass: torch counts its devices once, at the first
 CHROMIUM_FLAGS = (
@@ -56,3 +57,20 @@ def browser():
         chromium = playwright.chromium.launch(executable_path=executable, args=CHROMIUM_FLAGS.split())
         yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def change_source(monkeypatch):
+    """Lets the ledger take the code of a module for another version of it, for the length of a test."""
+
+    def change(module: str) -> None:
+        monkeypatch.setitem(ledger.SOURCES, module, ledger.SOURCES[module] + b"\nCHANGED = True\n")
+        forget()
+
+    def forget() -> None:
+        ledger.source_digest.cache_clear()
+        ledger.module_digest.cache_clear()
+
+    yield change
+    monkeypatch.undo()
+    forget()

@@ -2,8 +2,11 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -21,21 +24,40 @@ ROOT = Path(__file__).parents[1]
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SIZES = sorted(path.stem for path in (CONF / "size").glob("*.yaml"))
+WITH_SETTINGS = [verb for verb, entry in VERBS.items() if entry.settings]
 
 
-@pytest.mark.parametrize("verb", [verb for verb, entry in VERBS.items() if entry.settings])
+@pytest.mark.parametrize("verb", WITH_SETTINGS)
 def test_every_verb_composes_and_has_its_tool(verb):
     assert type(load(verb)) is settings_class(verb)
     assert (ROOT / "tools" / f"{verb}.py").is_file()
     assert (CONF / f"{verb}.yaml").read_text().startswith(f"# python tools/{verb}.py")
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", WITH_SETTINGS)
 def test_no_option_of_a_verb_is_taken_for_a_choice_among_files(verb):
     """An option with the name of a folder of `conf/` chooses one of its files, whatever verb it is given to."""
     chosen = {str(name) for entry in yaml.safe_load((CONF / f"{verb}.yaml").read_text())["defaults"] for name in entry}
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
-    assert groups & settings_to_dict(VERBS[verb]()).keys() <= chosen
+    assert groups & settings_to_dict(settings_class(verb)()).keys() <= chosen
+
+
+@pytest.mark.parametrize("verb", WITH_SETTINGS)
+def test_every_verb_writes_below_the_roots_of_runs_and_data_unless_told_otherwise(verb):
+    """Trying something must not overwrite the published tables, nor anything else of the folder it is tried in."""
+    assert [(name, str(path)) for name, path in paths_of(load(verb)) if path.parts[0] not in ("runs", "data")] == []
+
+
+def paths_of(settings: Any, prefix: str = "") -> Iterator[tuple[str, Path]]:
+    """Every path among a verb's settings, by the name of its option."""
+    for field in fields(settings):
+        value, name = getattr(settings, field.name), f"{prefix}{field.name}"
+        if is_dataclass(value):
+            yield from paths_of(value, f"{name}.")
+        elif isinstance(value, Path) or field.name == "root":
+            yield name, Path(value)
+        elif isinstance(value, tuple):
+            yield from ((name, item) for item in value if isinstance(item, Path))
 
 
 @pytest.mark.parametrize("method", METHODS)

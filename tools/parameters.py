@@ -1,4 +1,4 @@
-"""Counts every method's parameters at both sizes: writes docs/results/parameters.csv and .md."""
+"""Counts every method's parameters at both sizes: python tools/parameters.py [out=docs/results]"""
 
 from start import run
 

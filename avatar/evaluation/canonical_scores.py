@@ -26,11 +26,14 @@ from avatar.evaluation.canonical_truth import (
 from avatar.evaluation.closest import closest_on_mesh
 from avatar.evaluation.metrics import Metric
 from avatar.evaluation.scores import FrameScore, Score, Scores
-from avatar.evaluation.scoring import Label, Outfit, mean_scores
+from avatar.evaluation.scoring import Label, Outfit, mean_scores, remember
 from avatar.evaluation.tables import Table, TableRow
+from avatar.io.ledger import Ledger
 from avatar.progress import tracked
 from avatar.records import Frame, Mesh, Template
 
+# What a score is made by, beside the canonicalization: metrics and the readers of data sets.
+SOURCE = ("avatar.evaluation.canonical_scores", "avatar.data.layouts")
 TRUE = "true weights"
 SURFACE_POINTS = 2_000  # canonical points a frame whose distance to the true surface is measured
 
@@ -199,7 +202,12 @@ CANONICAL_METRICS: dict[str, Metric] = {
 
 
 def score_canonicalization(
-    outfit: Outfit, split: str, names: Sequence[str], methods: Mapping[Label, Callable[[Frame], Canonicalized]]
+    outfit: Outfit,
+    split: str,
+    names: Sequence[str],
+    methods: Mapping[Label, Callable[[Frame], Canonicalized]],
+    ledger: Ledger | None = None,
+    made_by: Mapping[Label, str] | None = None,
 ) -> Scores:
     """Every metric of every frame for several canonicalizations, and for the true weights beside them.
 
@@ -211,6 +219,8 @@ def score_canonicalization(
         split: train or test.
         names: frames of the split.
         methods: for each its label and what it makes of a frame as the outfit loads it.
+        ledger: where values are kept, so that only new or changed ones are measured; None measures all.
+        made_by: with a ledger, a hash of all that each method's canonical scans depend on but the data.
 
     Raises:
         AvatarError: naming the frame, for data without truth or a canonical scan that is not the frame's.
@@ -219,22 +229,27 @@ def score_canonicalization(
         raise AvatarError(f"methods, names: expected at least one each, got {len(methods)} and {len(names)}.")
     first = next(iter(methods))
     shared = first.variant if len({label.variant for label in methods}) == 1 else ""
-    labels = [Label(TRUE, table=first.table, variant=shared, commit=first.commit), *methods]
-    template = outfit.template
+    true = Label(TRUE, table=first.table, variant=shared, commit=first.commit)
+    labels, made_by = [true, *methods], {true: "", **(made_by or {})}
+    memories = {
+        label: remember(ledger, f"canonical {label.method}", outfit, split, SOURCE, made_by=ledger and made_by[label])
+        for label in labels
+    }
     surfaces = canonical_surfaces(outfit, split, names[0])
     frames: list[FrameScore] = []
     counts: dict[Label, list[int]] = {label: [] for label in labels}
     for name in tracked(names, f"score canonical scans of {outfit.name}"):
-        frame = outfit.load(split, name)
+        known = {label: memory.recall(name, CANONICAL_METRICS) for label, memory in memories.items()}
+        missing = {label: methods.get(label) for label in labels if len(known[label][0]) < len(CANONICAL_METRICS)}
         try:
-            truth = frame_truth(frame.scan, template)
-            for label in labels:
-                result = methods[label](frame) if label in methods else carry_truly(frame, truth, template)
-                comparison = CanonicalComparison(frame, truth, result, template, surfaces)
-                counts[label].append(len(result.scan.points))
-                frames += _frame_scores(comparison, outfit.name, label)
+            new = _measure_frame(outfit.load(split, name), outfit.template, surfaces, missing) if missing else {}
         except AvatarError as error:
             raise AvatarError(f"outfit {outfit.name}, frame {name}: {error}") from error
+        for label, measured in new.items():
+            memories[label].note(name, *measured)
+        for label, (values, points) in (known | new).items():
+            counts[label].append(points)
+            frames += _frame_scores(values, outfit.name, name, label)
     rows = [row for label in labels for row in _mean_rows(frames, label, round(float(np.mean(counts[label]))))]
     return Scores(rows, frames)
 
@@ -249,12 +264,26 @@ def canonical_surfaces(outfit: Outfit, split: str, name: str) -> dict[int, Mesh]
     return {int(i): Mesh(whole.canonical.numpy(), faces[labels[faces[:, 0]] == i]) for i in np.unique(labels)}
 
 
-def _frame_scores(comparison: CanonicalComparison, outfit: str, label: Label) -> list[FrameScore]:
+def _measure_frame(
+    frame: Frame,
+    template: Template,
+    surfaces: Mapping[int, Mesh],
+    methods: Mapping[Label, Callable[[Frame], Canonicalized] | None],
+) -> dict[Label, tuple[dict[str, float], int]]:
+    """Every metric of a frame, NaN where it does not have one, and the point count, for each method; None is `TRUE`."""
+    truth, found = frame_truth(frame.scan, template), {}
+    for label, carry in methods.items():
+        result = carry_truly(frame, truth, template) if carry is None else carry(frame)
+        comparison = CanonicalComparison(frame, truth, result, template, surfaces)
+        values = {name: float(metric.measure(comparison)) for name, metric in CANONICAL_METRICS.items()}
+        found[label] = values, len(result.scan.points)
+    return found
+
+
+def _frame_scores(values: Mapping[str, float], outfit: str, frame: str, label: Label) -> list[FrameScore]:
     """The metrics that a frame has."""
-    values = {name: float(metric.measure(comparison)) for name, metric in CANONICAL_METRICS.items()}
-    name = comparison.frame.name
     return [
-        FrameScore(outfit, label.method, label.variant, label.seed, name, metric, value)
+        FrameScore(outfit, label.method, label.variant, label.seed, frame, metric, value)
         for metric, value in values.items()
         if np.isfinite(value)
     ]

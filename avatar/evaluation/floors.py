@@ -20,7 +20,7 @@ from avatar.evaluation.scoring import (
     frame_names,
     pick_points,
     posed_body,
-    remember,
+    remember_scores,
     score_frames,
 )
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
@@ -46,7 +46,7 @@ def score_sampling_floor(
 
     Args:
         points: points of the second sampling; take as many as the methods predict.
-        ledger: where scored frames are taken down, as for predictions.
+        ledger: where values are kept, as for predictions.
     """
     names = frame_names(outfit, split)
     resample = getattr(outfit, "resample", None)
@@ -66,7 +66,7 @@ def score_sampling_floor(
         log.warning("%s: no true surface to sample again, so the sampling floor compares scan halves.", outfit.name)
     label = Label("sampling", table=table, variant="halves" if resample is None else "", commit=commit)
     config = replace(config, motion=False)
-    memory = remember(ledger, "sampling", outfit, split, config, points=points)
+    memory = remember_scores(ledger, "sampling", outfit, split, config, points=points)
     return score_frames(outfit, split, names, config, label, compare, memory)
 
 
@@ -90,7 +90,7 @@ def score_body_floor(
 
     label = Label("body", table=table, commit=commit)
     config = replace(config, motion=False)
-    memory = remember(ledger, "body", outfit, split, config, points=points)
+    memory = remember_scores(ledger, "body", outfit, split, config, points=points)
     return score_frames(outfit, split, names, config, label, compare, memory)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import zlib
 from collections.abc import Callable, Iterable, Sequence
@@ -24,6 +25,9 @@ from avatar.records import Frame, Mesh, PointCloud, Scan
 
 log = logging.getLogger(__name__)
 
+# What a score is made by: metrics, floors and the draw of points, and the readers of data sets. Not how tables and
+# plots are made of scores, nor how what is scored was trained: that shows in the hash of the prediction's file.
+SOURCE = ("avatar.evaluation.floors", "avatar.data.layouts")
 SIZE_RATIO = 5.0  # a prediction this many times larger or smaller than its scan is in other units
 
 
@@ -78,42 +82,59 @@ class Label:
 
 @dataclass(frozen=True)
 class Memory:
-    """Frames that were scored before: a ledger, what is scored in words, and the hash of what a frame's is made of."""
+    """Values that were measured before, each metric of each frame for itself.
 
-    ledger: Ledger
+    ``ledger`` keeps them (None: nothing is kept), ``what`` says in words what is scored, and ``made_of`` gives the hash
+    of all that a frame's values are made of.
+    """
+
+    ledger: Ledger | None
     what: str
     made_of: Callable[[str], str]
 
-    def recall(self, name: str) -> dict[str, Any] | None:
-        """The values and the point count of a frame, where nothing that they were made from has changed."""
-        return self.ledger.find(f"{self.what}/{name}", self.made_of(name))
+    def recall(self, frame: str, metrics: Iterable[str]) -> tuple[dict[str, float], int]:
+        """The known values of a frame by metric, and its point count; nothing that was made of something else."""
+        if self.ledger is None:
+            return {}, 0
+        key = self.made_of(frame)
+        found = {metric: self.ledger.find(f"{self.what}/{frame}/{metric}", key) for metric in metrics}
+        found = {metric: note for metric, note in found.items() if note}
+        points = max((note["points"] for note in found.values()), default=0)
+        return {metric: note["value"] for metric, note in found.items()}, points
 
-    def note(self, name: str, values: dict[str, float], points: int) -> None:
-        """Takes down a frame's values."""
-        self.ledger.record(f"{self.what}/{name}", self.made_of(name), note={"values": values, "points": points})
+    def note(self, frame: str, values: dict[str, float], points: int) -> None:
+        """Writes a frame's values down."""
+        if self.ledger is not None and values:
+            notes = {f"{self.what}/{frame}/{metric}": {"value": v, "points": points} for metric, v in values.items()}
+            self.ledger.record_notes(self.made_of(frame), notes)
 
 
-def remember(
-    ledger: Ledger | None, what: str, outfit: Any, split: str, config: ScoreConfig, **made: Any
-) -> Memory | None:
-    """The memory of one method's scores on an outfit; none without a ledger or for motion, whose frames hang together.
+def remember(ledger: Ledger | None, what: str, outfit: Any, split: str, source: tuple[str, ...], **made: Any) -> Memory:
+    """The memory of one method's scores on an outfit.
 
     Args:
         ledger: where it is kept.
         what: the method, in words.
-        outfit: a data set's outfit, with `digest` and maybe a ``scanner``.
-        split, config: what is scored, and how.
+        outfit, split: what is scored: a data set's outfit, with `digest` and maybe a ``scanner``.
+        source: the modules that make the values, see `keyed`.
         made: what else the values depend on; functions are asked for each frame by its name.
     """
-    if ledger is None or config.motion:
-        return None
-    facts = {"config": vars(config), "scanner": vars(outfit.scanner) if hasattr(outfit, "scanner") else None}
 
+    @functools.cache
     def made_of(name: str) -> str:
         parts = {key: value(name) if callable(value) else value for key, value in made.items()}
-        return keyed(frame=outfit.digest(split, name), **facts, **parts)
+        scanner = vars(outfit.scanner) if hasattr(outfit, "scanner") else None
+        return keyed(source, frame=outfit.digest(split, name), scanner=scanner, **parts)
 
     return Memory(ledger, f"{what} {outfit.name} {split}", made_of)
+
+
+def remember_scores(
+    ledger: Ledger | None, what: str, outfit: Any, split: str, config: ScoreConfig, **made: Any
+) -> Memory:
+    """The memory of scores of points; none for motion, whose frames hang together."""
+    drawn = {"scan_points": config.scan_points, "seed": config.seed}
+    return remember(None if config.motion else ledger, what, outfit, split, SOURCE, **drawn, **made)
 
 
 def score_predictions(
@@ -135,7 +156,7 @@ def score_predictions(
         label: method, variant and training facts for the rows.
         meshes: a folder of predicted meshes, ``<frame>.ply`` or ``.obj``, which s2m_cm and normal_consistency then
             measure instead of the points; None for point methods.
-        ledger: where scored frames are taken down, so that only new or changed ones are scored; None scores all.
+        ledger: where values are kept, so that only new or changed ones are measured; None measures all.
 
     Returns:
         `Scores`: one row a metric, and the single frames.
@@ -158,7 +179,7 @@ def score_predictions(
     def made_of(name: str) -> list[str]:
         return [file_digest(files[name]) for files in (clouds, surfaces) if files]
 
-    memory = remember(ledger, "predictions", outfit, split, config, predicted=made_of)
+    memory = remember_scores(ledger, "predictions", outfit, split, config, predicted=made_of)
     return score_frames(outfit, split, names, config, label, compare, memory)
 
 
@@ -237,12 +258,12 @@ def score_frames(
     config: ScoreConfig,
     label: Label,
     compare: Callable[[Frame], Comparison],
-    memory: Memory | None = None,
+    memory: Memory,
 ) -> Scores:
     """Every metric of every frame, and their means.
 
     ``compare`` makes the `Comparison` of a frame. Errors it or a metric raises are passed on with the frame's name.
-    Frames that ``memory`` knows are not looked at again.
+    Values that ``memory`` knows are not measured again.
     """
     metrics = [m for m in find_metrics(config.metrics) if not m.needs_body or getattr(outfit, "template", None)]
     if len(metrics) < len(config.metrics):
@@ -250,23 +271,22 @@ def score_frames(
     frames: list[FrameScore] = []
     counts, window = [], []
     for name in tracked(sorted(names, key=_in_time), f"score {label.method} on {outfit.name}"):
-        known = memory.recall(name) if memory else None
-        if known:
-            values, points = known["values"], known["points"]
-        else:
+        values, points = memory.recall(name, [m.name for m in metrics])
+        missing = [m for m in metrics if not m.sequential and m.name not in values]
+        if missing or config.motion:
             try:
                 comparison = compare(outfit.load(split, name))
-                values = {m.name: float(m.measure(comparison)) for m in metrics if not m.sequential}
+                new = {m.name: float(m.measure(comparison)) for m in missing}
                 if config.motion:
                     window = [*window, (name, comparison.points)][-3:]
-                    values |= _measure_sequence([m for m in metrics if m.sequential], window)
+                    new |= _measure_sequence([m for m in metrics if m.sequential], window)
             except DataError:
                 raise
             except AvatarError as error:
                 raise AvatarError(f"outfit {outfit.name}, {label.method}, frame {name}: {error}") from error
             points = len(comparison.points)
-            if memory:
-                memory.note(name, values, points)
+            memory.note(name, new, points)
+            values |= new
         counts.append(points)
         frames += [
             FrameScore(outfit.name, label.method, label.variant, label.seed, name, metric, float(value))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,9 @@ USD_FORMATS = (".usdc", ".usda", ".usd")
 PICTURE_FORMATS = {".gif": "GIF", ".webp": "WEBP"}
 
 
-def write_usd_points(path: str | Path, clouds: Iterable[PointCloud], fps: float) -> None:
+def write_usd_points(
+    path: str | Path, clouds: Iterable[PointCloud], fps: float, frames: Sequence[int] | None = None
+) -> None:
     """Writes a sequence of oriented points as USD: one `Points` prim, time-sampled, counts may change.
 
     Metres, y up. Widths are the points' own spacing, so that Blender or usdview show a closed surface.
@@ -27,10 +29,12 @@ def write_usd_points(path: str | Path, clouds: Iterable[PointCloud], fps: float)
     Args:
         path: ends in .usdc (compact), .usda (text) or .usd.
         clouds: one a frame; may be a generator, and only one is in memory at a time.
-        fps: frames per second; frame i has time code i.
+        fps: frames per second.
+        frames: the frames' numbers, rising, which become their time codes; 0, 1, 2, ... if None. Where numbers are
+            missing the frame before them is held.
 
     Raises:
-        AvatarError: for no frames, wrong shapes, non-finite values or fps, or when usd-core is missing.
+        AvatarError: for no frames, wrong shapes, numbers, non-finite values or fps, or when usd-core is missing.
         DataError: for another file name ending.
     """
     usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
@@ -52,10 +56,10 @@ def write_usd_points(path: str | Path, clouds: Iterable[PointCloud], fps: float)
 
         return sample
 
-    _write_usd(path, clouds, fps, define)
+    _write_usd(path, clouds, fps, frames, define)
 
 
-def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float) -> None:
+def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float, frames: Sequence[int] | None = None) -> None:
     """Writes a sequence of meshes as USD: one `Mesh` prim, time-sampled, whose triangles may change by frame.
 
     Metres, y up, right-handed, no subdivision; colours become ``displayColor``. Blender, Maya and Unreal read it.
@@ -63,10 +67,10 @@ def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float) -> No
     Args:
         path: ends in .usdc (compact), .usda (text) or .usd.
         meshes: one a frame; may be a generator, and only one is in memory at a time.
-        fps: frames per second; frame i has time code i.
+        fps, frames: as `write_usd_points`.
 
     Raises:
-        AvatarError: for no frames, meshes that are not sound, fps, or when usd-core is missing.
+        AvatarError: for no frames, meshes that are not sound, numbers, fps, or when usd-core is missing.
         DataError: for another file name ending.
     """
     usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
@@ -91,10 +95,10 @@ def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float) -> No
 
         return sample
 
-    _write_usd(path, meshes, fps, define)
+    _write_usd(path, meshes, fps, frames, define)
 
 
-def _write_usd(path: str | Path, items: Iterable, fps: float, define: Callable) -> None:
+def _write_usd(path: str | Path, items: Iterable, fps: float, frames: Sequence[int] | None, define: Callable) -> None:
     """The stage around the samples: units, axes, time; whole or not at all."""
     path = Path(path)
     if path.suffix.lower() not in USD_FORMATS:
@@ -111,15 +115,33 @@ def _write_usd(path: str | Path, items: Iterable, fps: float, define: Callable) 
         stage.SetFramesPerSecond(fps)
         stage.SetDefaultPrim(usd_geom.Xform.Define(stage, "/avatar").GetPrim())
         sample = define(stage)
-        frame = -1
-        for frame, item in enumerate(items):
-            sample(item, frame)
-        if frame < 0:
-            raise AvatarError("frames: expected at least one to write, got none.")
-        stage.SetStartTimeCode(0)
-        stage.SetEndTimeCode(frame)
+        last = held = None
+        for number, item in _numbered(items, frames):
+            if last is None:
+                stage.SetStartTimeCode(number)
+            elif number > last + 1:
+                sample(held, number - 1)  # programs blend neighbouring samples, which over a gap would be wrong
+            sample(item, number)
+            last, held = number, item
+        stage.SetEndTimeCode(last)
         stage.GetRootLayer().Save()
         partial.replace(path)
+
+
+def _numbered(items: Iterable, frames: Sequence[int] | None) -> Iterator[tuple[int, Any]]:
+    """Items with their frames' numbers; from 0 on if None.
+
+    Raises:
+        AvatarError: for no items, and for numbers that do not rise or are more or fewer than the items.
+    """
+    count = 0
+    for count, item in enumerate(items, start=1):
+        if frames is not None and (count > len(frames) or (count > 1 and frames[count - 1] <= frames[count - 2])):
+            raise AvatarError(f"frames: expected a rising number for each item, got {list(frames)[:count]}.")
+        yield (count - 1 if frames is None else int(frames[count - 1])), item
+    if not count or (frames is not None and count < len(frames)):
+        wanted = "at least one" if frames is None else str(len(frames))
+        raise AvatarError(f"frames: expected {wanted} to write, got {count or 'none'}.")
 
 
 def _vectors(vt: Any, values: np.ndarray) -> Any:
@@ -135,16 +157,21 @@ def _check_fps(fps: float) -> None:
         raise AvatarError(f"fps: expected frames per second in (0, 1000], got {fps}.")
 
 
-def write_animation(path: str | Path, images: Sequence[np.ndarray], fps: float) -> None:
+def write_animation(
+    path: str | Path, images: Sequence[np.ndarray], fps: float, frames: Sequence[int] | None = None
+) -> None:
     """Writes pictures as a film that loops: WebP in full colour, or GIF in 255 colours and steps of 10 ms.
+
+    Each picture stands until the next one's time, so that a film is as long as its frames' numbers say.
 
     Args:
         path: ends in .webp or .gif.
         images: ``(H, W, 3)`` uint8, all of one size.
         fps: frames per second.
+        frames: the pictures' numbers, rising; 0, 1, 2, ... if None. The first one's is the beginning.
 
     Raises:
-        AvatarError: for no pictures, different sizes or fps.
+        AvatarError: for no pictures, different sizes, numbers or fps.
         DataError: for another file name ending.
     """
     path = Path(path)
@@ -156,13 +183,15 @@ def write_animation(path: str | Path, images: Sequence[np.ndarray], fps: float) 
     height, width = check_shape("images[0]", images[0], "H W 3").values()
     for picture in images:
         check_shape("images", picture, f"{height} {width} 3")
-    frames = [require("PIL.Image").fromarray(np.ascontiguousarray(picture, np.uint8)) for picture in images]
+    numbers = [number for number, _ in _numbered(images, frames)]
+    pictures = [require("PIL.Image").fromarray(np.ascontiguousarray(picture, np.uint8)) for picture in images]
     kind = PICTURE_FORMATS[path.suffix.lower()]
     if kind == "GIF":
-        frames = [frame.quantize(255, dither=0) for frame in frames]
+        pictures = [picture.quantize(255, dither=0) for picture in pictures]
+    tick = 10 if kind == "GIF" else 1  # ms
+    ticks = np.rint((np.array([*numbers, numbers[-1] + 1]) - numbers[0]) * 1000 / fps / tick).astype(int)
+    durations = [max(int(count), 1) * tick for count in np.diff(ticks)]
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / f"film{path.suffix.lower()}"
-        frames[0].save(
-            film, kind, save_all=True, append_images=frames[1:], duration=round(1000 / fps), loop=0, quality=85
-        )
+        pictures[0].save(film, kind, save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=85)
         write_whole(path, film.read_bytes())

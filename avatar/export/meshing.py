@@ -27,6 +27,7 @@ from avatar.processes import interrupts_blocked
 from avatar.progress import tracked
 from avatar.records import Mesh, PointCloud
 
+SOURCE = ("avatar.export.meshing",)
 MIN_POINTS = 100
 EXTENTS = (1e-3, 1e3)  # metres; outside, open3d hangs or the units are wrong
 GRACE_S = 5.0  # beyond timeout_s, for a worker that is stuck before or amid its answer
@@ -271,7 +272,7 @@ def mesh_folder(
             source = predictions_dir / f"{name}.ply"
             targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
             made = [getattr(settings, option) for option in ("depth", "max_hole", "min_part")]
-            key = keyed(cloud=file_digest(source), formats=formats, poisson=made)
+            key = keyed(SOURCE, cloud=file_digest(source), formats=formats, poisson=made)
             if ledger.find(name, key):
                 skipped.append(name)
                 continue

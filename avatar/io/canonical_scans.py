@@ -1,4 +1,4 @@
-"""Canonical scans on disk: one npz a frame, with a stamp of what made it, so that finished ones are known."""
+"""Canonical scans on disk: one npz a frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FAST = 1  # level of deflating: as small as level 9 but for 2%, in a tenth of th
 UNIT_TOLERANCE = 1e-2  # of normals and of the sums of weights
 
 
-def write_canonical_scan(path: str | Path, scan: CanonicalScan, stamp: str = "") -> None:
+def write_canonical_scan(path: str | Path, scan: CanonicalScan) -> None:
     """Writes a canonical scan; weights are rounded to 1/65535, everything else is exact in float32.
 
     Weights are stored joint by joint, which deflates four times faster than point by point.
@@ -24,7 +24,6 @@ def write_canonical_scan(path: str | Path, scan: CanonicalScan, stamp: str = "")
     Args:
         path: where to, ending in .npz.
         scan: what to write.
-        stamp: what it was made by, any text; `read_stamp` gives it back.
 
     Raises:
         AvatarError: for shapes that do not fit, non-finite numbers, normals that are not unit or indices out of range.
@@ -32,7 +31,6 @@ def write_canonical_scan(path: str | Path, scan: CanonicalScan, stamp: str = "")
     check_canonical_scan(scan)
     arrays = {
         "format": np.array(FORMAT),
-        "stamp": np.array(stamp),
         "points": np.asarray(scan.points, np.float32),
         "normals": np.asarray(scan.normals, np.float32),
         "weights": np.rint(np.asarray(scan.weights).T * STEPS).astype(np.uint16),
@@ -76,11 +74,6 @@ def read_canonical_scan(path: str | Path) -> CanonicalScan:
     except AvatarError as error:
         raise DataError(path, str(error), "Canonicalize the scan again.") from error
     return scan
-
-
-def read_stamp(path: str | Path) -> str:
-    """What a canonical scan's file says it was made by. Raises `DataError` where it is not sound."""
-    return str(read_arrays(Path(path), {"stamp": "text "})["stamp"])
 
 
 def check_canonical_scan(scan: CanonicalScan) -> None:

@@ -2,43 +2,58 @@
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from avatar.checks import DataError
+from avatar.io.file_locks import lock_file
 from avatar.progress import WORK
 
 LEDGER = ".finished.jsonl"
+PACKAGE = Path(__file__).parents[1]
+
+
+def read_sources(package: Path) -> dict[str, bytes]:
+    """The source of every module of this package by dotted name, from a folder that holds it."""
+    found = {}
+    for path in sorted(package.rglob("*.py")):
+        parts = ("avatar", *path.relative_to(package).with_suffix("").parts)
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path.read_bytes()
+    return found
+
+
+SOURCES = read_sources(PACKAGE)  # as the program began: a file edited while it runs is not what it computes with
 
 
 class Ledger:
-    """The finished pieces of work in a folder, each by name, so that a command goes on where it stopped.
+    """The finished pieces of work in a folder, each by name and key, so that a command goes on where it stopped.
 
-    A piece counts as finished when its key is the same (everything it was made from) and its files still have the
-    sha256 they were written with; a damaged, changed or missing one is to be done again. Lines are only ever added,
-    each sealed with its own hash: one that a killed process left half-written is passed over.
+    The key is a hash of everything a piece was made from. A piece counts as finished when its key is there and its
+    files still have the sha256 they were written with; a damaged, changed or missing one is to be done again. Pieces
+    of one name and several keys stand beside each other. Lines are only ever added, under a lock, each sealed with its
+    own hash: one that a killed process left half-written is passed over, and takes no other with it.
     """
 
     def __init__(self, folder: Path):
         """Reads what a folder's ledger says; a folder without one has finished nothing."""
         self.path = Path(folder) / LEDGER
-        self.entries: dict[str, dict[str, Any]] = {}
-        data = self.path.read_bytes() if self.path.is_file() else b""
-        for line in data.splitlines():
+        self.entries: dict[str, dict[str, dict[str, Any]]] = {}  # by name and key
+        for line in self.path.read_bytes().splitlines() if self.path.is_file() else ():
             entry = _unseal(line)
             if entry is not None:
-                self.entries[entry["name"]] = entry
-        self.torn = bool(data) and not data.endswith(b"\n")
+                self._keep(entry)
 
     def find(self, name: str, key: str) -> Any:
         """What was noted of a finished piece (`True` where nothing was), or None where it has to be done."""
-        entry = self.entries.get(name)
-        if entry is None or entry["key"] != key:
+        entry = self.entries.get(name, {}).get(key)
+        if entry is None:
             return None
         for file, digest in entry["files"].items():
             path = self.path.parent / file
@@ -53,19 +68,37 @@ class Ledger:
         Raises:
             DataError: when the disk refuses.
         """
-        folder = self.path.parent
-        listed = {os.path.relpath(path, folder): file_digest(path) for path in files}
-        entry = {"name": name, "key": key, "files": listed, "note": note}
-        line = json.dumps({**entry, "seal": digest_of(entry)}).encode() + b"\n"
+        listed = {os.path.relpath(path, self.path.parent): file_digest(path) for path in files}
+        self._append([{"name": name, "key": key, "files": listed, "note": note}])
+
+    def record_notes(self, key: str, notes: Mapping[str, Any]) -> None:
+        """Notes several finished pieces of one key, each by name with its plain values.
+
+        Raises:
+            DataError: when the disk refuses.
+        """
+        self._append([{"name": name, "key": key, "files": {}, "note": note} for name, note in notes.items()])
+
+    def _append(self, entries: list[dict[str, Any]]) -> None:
+        """Adds lines at the end of the file, behind those that other processes have added meanwhile."""
+        lines = b"".join(json.dumps({**entry, "seal": digest_of(entry)}).encode() + b"\n" for entry in entries)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with self.path.open("ab") as stream:
-                stream.write(b"\n" * self.torn + line)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a+b") as stream:
+                lock_file(stream)
+                if size := stream.seek(0, os.SEEK_END):
+                    stream.seek(size - 1)
+                    lines = lines if stream.read(1) == b"\n" else b"\n" + lines  # behind a half-written line
+                stream.write(lines)
         except OSError as error:
             mend = "Make room and give the same command again."
             raise DataError(self.path, f"could not be written ({error.strerror}).", mend) from error
-        self.torn, self.entries[name] = False, entry
-        WORK["made"] += 1
+        for entry in entries:
+            self._keep(entry)
+        WORK["made"] += len(entries)
+
+    def _keep(self, entry: dict[str, Any]) -> None:
+        self.entries.setdefault(entry["name"], {})[entry["key"]] = entry
 
 
 def _unseal(line: bytes) -> dict[str, Any] | None:
@@ -102,12 +135,36 @@ def files_digest(folder: Path) -> str:
 
 
 @functools.cache
-def code_digest() -> str:
-    """One hash over this program's own source: what another version made is not taken for what this one would."""
-    root = Path(__file__).parents[1]
-    return digest_of({str(path.relative_to(root)): file_digest(path) for path in sorted(root.rglob("*.py"))})
+def source_digest(*modules: str) -> str:
+    """One hash over the code of modules of this package and of all that they import from it, directly or not.
+
+    What another version of that code made is not taken for what this one would make; changes elsewhere in the package,
+    comments and line breaks do not count.
+    """
+    found, new = set(), set(modules)
+    while new:
+        found |= new
+        new = {other for name in new for other in imported_modules(name)} - found
+    return digest_of({name: module_digest(name) for name in found})
 
 
-def keyed(**parts: Any) -> str:
-    """The key of a piece of work: one hash over all that it is made from, this program's source included."""
-    return digest_of({"code": code_digest(), **parts})
+@functools.cache
+def module_digest(module: str) -> str:
+    """A hash over the code of one module of this package alone; comments and line breaks do not count."""
+    return hashlib.sha256(ast.dump(ast.parse(SOURCES[module])).encode()).hexdigest()
+
+
+def imported_modules(module: str) -> set[str]:
+    """The modules of this package that one of them imports, inside its functions too, and the packages they are in."""
+    names = set()
+    for node in ast.walk(ast.parse(SOURCES[module])):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return {part for name in names for part in accumulate(name.split("."), "{}.{}".format)} & SOURCES.keys()
+
+
+def keyed(source: tuple[str, ...], **parts: Any) -> str:
+    """The key of a piece of work: one hash over all that it is made from, and over the modules that make it."""
+    return digest_of({"source": source_digest(*source), **parts})

@@ -22,6 +22,7 @@ from avatar.evaluation.tables import to_markdown
 from avatar.export.drawing import Camera, frame_camera, load_pyvista
 from avatar.export.pictures import contact_sheet, render_mesh, render_points, save_picture
 from avatar.io.canonical_scans import read_canonical_scan
+from avatar.io.ledger import Ledger, digest_of, module_digest
 from avatar.io.npz import write_whole
 from avatar.pipeline.scores import current_commit
 from avatar.pipeline.surfaces import spaced_frames
@@ -32,9 +33,11 @@ from avatar.training.canonicalizing import (
     Skinning,
     TrainedCanonicalizer,
     canonicalize_frames,
+    scans_digest,
     skinning_source,
     train_canonicalizer,
 )
+from avatar.training.locks import lock_folder
 
 COLUMNS = ("scan", "weights", "canonical, front", "canonical, back", "weights, front", "weights, back")
 PICTURE = (480, 480)
@@ -76,27 +79,33 @@ def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
 def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> Scores:
     """Writes ``<run>/scores.csv`` and ``scores.md``: this run, both rivals and the true weights on some frames.
 
-    Variants are the splits: frames of training were learned from, those of test found their codes alone.
+    Variants are the splits: frames of training were learned from, those of test found their codes alone. What was
+    measured before is measured again only where a scan, a canonicalizer or the code of either has changed.
 
     Raises:
         AvatarError: for data that were not simulated: nobody knows their canonical places.
     """
     outfit, scores, tables = frames.outfits[0], Scores(), []
     kinds = dict.fromkeys((config.weights, Skinning.knn, Skinning.nearest))
-    for split in dict.fromkeys(where.split for where in frames.names):
-        names = spaced_frames([where.name for where in frames.names if where.split == split], config.scored)
-        methods = {}
-        for kind in kinds:
-            source = skinning_source(replace(config, weights=kind), outfit.template)
-            learned = (source.steps, source.seconds) if isinstance(source, TrainedCanonicalizer) else (0, 0.0)
-            methods[Label(kind.value, "canonical", split, 0, *learned, current_commit())] = carrier(config, source)
-        found = score_canonicalization(outfit, split, names, methods)
-        plain = [replace(row, variant="") for row in found.rows]
-        tables.append(f"## {split}\n\n{to_markdown(canonical_table(plain, outfit.name))}")
-        scores = scores + found
-    write_scores(config.folder / "scores.csv", scores)
-    text = "\n".join(tables)
-    write_whole(config.folder / "scores.md", text.encode())
+    with lock_folder(config.folder, wait=True):
+        ledger = Ledger(config.folder)
+        for split in dict.fromkeys(where.split for where in frames.names):
+            names = spaced_frames([where.name for where in frames.names if where.split == split], config.scored)
+            methods, made_by = {}, {}
+            for kind in kinds:
+                settings = replace(config, weights=kind)
+                source = skinning_source(settings, outfit.template)
+                learned = (source.steps, source.seconds) if isinstance(source, TrainedCanonicalizer) else (0, 0.0)
+                label = Label(kind.value, "canonical", split, 0, *learned, current_commit())
+                methods[label] = carrier(config, source)
+                made_by[label] = digest_of([scans_digest(settings), module_digest(__name__)])
+            found = score_canonicalization(outfit, split, names, methods, ledger, made_by)
+            plain = [replace(row, variant="") for row in found.rows]
+            tables.append(f"## {split}\n\n{to_markdown(canonical_table(plain, outfit.name))}")
+            scores = scores + found
+        text = "\n".join(tables)
+        write_scores(config.folder / "scores.csv", scores)
+        write_whole(config.folder / "scores.md", text.encode())
     print(text)
     return scores
 

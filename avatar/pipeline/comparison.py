@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,9 @@ from avatar.evaluation.scores import Score, Scores, read_scores, write_scores
 from avatar.evaluation.tables import Table, View, outfit_table, to_latex, to_markdown
 from avatar.io.npz import write_whole
 from avatar.pipeline.pose_grid import draw_pose_grid
-from avatar.pipeline.scores import read_all_scores, scores_file
+from avatar.pipeline.scores import are_current, read_all_scores, read_floors, scores_file
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -44,7 +47,7 @@ class CompareConfig:
     pictures: int = 3  # unseen poses an outfit in the picture of all methods; 0 for none
     splits: tuple[str, ...] = ("test",)  # that were scored; the first is the picture's
     data_root: Path | None = None  # where the data are now; where they were at training if null
-    out: Path = Path("docs/results")
+    out: Path | None = None  # where the table's files go; <runs_root>/tables if null
 
     def __post_init__(self):
         check_name("table", self.table)
@@ -57,7 +60,7 @@ class CompareConfig:
 
 
 def compare(config: CompareConfig) -> Path:
-    """Writes ``<out>/<table>.*``; gives the path of the Markdown.
+    """Writes ``<out>/<table>.*``, which it prints; gives the path of the Markdown.
 
     ``.csv`` and ``.frames.csv`` hold the tidy scores, ``.md`` and ``.tex`` the tables, ``.differences.csv`` those to
     the baseline, ``.<plot>.png`` the plots, ``.poses.jpg`` the same unseen poses by all methods. Canonicalizers can be
@@ -73,7 +76,7 @@ def compare(config: CompareConfig) -> Path:
     text = "\n".join([*map(to_markdown, tables), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
     write_whole(file_of(config, "md"), text.encode())
     write_whole(file_of(config, "tex"), "\n".join(map(to_latex, tables)).encode())
-    print(text)
+    print(f"{text}\nwritten: {file_of(config, '*')}")
     return file_of(config, "md")
 
 
@@ -95,7 +98,7 @@ def compare_runs(config: CompareConfig, runs: tuple[Path, ...]) -> tuple[list[Ta
 
 def file_of(config: CompareConfig, suffix: str) -> Path:
     """One of the table's files."""
-    return config.out / f"{config.table}.{suffix}"
+    return (config.out or config.runs_root / "tables") / f"{config.table}.{suffix}"
 
 
 def named_runs(config: CompareConfig) -> Iterator[Path]:
@@ -113,6 +116,9 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
         AvatarError: when there are none, or outfits of one name come from several data sets.
     """
     scores, homes = Scores(), {}
+    files = [scores_file(run, split) for run in runs for split in config.splits]
+    if old := [str(path) for path in files if path.is_file() and not are_current(path)]:
+        log.warning("compare: scored by other code than today's, or edited: %s. Score them again.", ", ".join(old))
     for run in runs:
         mine = read_all_scores(scores_file(run, split) for split in config.splits)
         for row in mine.rows:
@@ -128,8 +134,7 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
         )
     floors = Scores()
     for outfit, (dataset,) in sorted(homes.items()):
-        path = config.runs_root / "floors" / dataset / outfit / "scores.csv"
-        floors = floors + (read_scores(path) if path.is_file() else Scores())
+        floors = floors + read_floors(config.runs_root, dataset, outfit, scores.rows)
     whole = floors + scores
     return Scores([replace(row, table=config.table) for row in whole.rows], whole.frames)
 

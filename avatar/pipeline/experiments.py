@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -14,22 +13,19 @@ from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.export.drawing import load_pyvista
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.io.npz import write_whole
 from avatar.nn.closet import Skinning
 from avatar.pipeline.canonicalization import check_scored, score_canonical_scans
 from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.methods import train
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict, read_all_scores, scores_file
-from avatar.settings import settings_to_dict
 from avatar.training.canonicalizing import CanonicalizeConfig, canonicalize_frames, train_canonicalizer
 from avatar.training.distributed import current_team
 from avatar.training.implicit_runs import METHOD as SCANIMATE
 from avatar.training.locks import lock_folder
 from avatar.training.prediction import check_count
-from avatar.training.runs import WEIGHTS, RunConfig, Space
+from avatar.training.runs import RunConfig, Space
 
 log = logging.getLogger(__name__)
-SCORED = "scored.txt"  # in a run's folder: what its scores were made of
 
 
 @dataclass
@@ -119,37 +115,17 @@ def prepare_canonicalizer(config: ExperimentConfig, outfit: str) -> None:
         frames = settings.frames()
         train_canonicalizer(settings, frames)
         canonicalize_frames(settings, frames)
-        if settings.scored and not (settings.folder / "scores.csv").is_file():
+        if settings.scored:
             score_canonical_scans(settings, frames)
 
 
 def score_run(config: ExperimentConfig, folder: Path) -> None:
-    """Predicts the frames of each split and scores them, unless the scores there are were made of the same."""
-    key = score_key(config, folder)
-    stamp = folder / SCORED
-    files = [scores_file(folder, split) for split in config.compare.splits]
-    if stamp.is_file() and stamp.read_text() == key and all(file.is_file() for file in files):
-        return
-    stamp.unlink(missing_ok=True)
+    """Predicts the frames of each split and scores them; what the folder's ledgers know is not done again."""
     made = {"points": config.points, "surface": config.surface, "device": config.device}
     for split in config.compare.splits:
         where = {"split": split, "data_root": config.data_root}
         predict(PredictConfig(run=folder, **made, **where))
         evaluate(EvaluateConfig(runs=(folder,), score=config.score, floors=split == "test", **where))
-    write_whole(stamp, key.encode())
-
-
-def score_key(config: ExperimentConfig, folder: Path) -> str:
-    """All that a run's scores depend on, as one hash: weights, data, points and metrics."""
-    parts = [_digest(folder / f"{WEIGHTS}.safetensors"), str(config.points)]
-    parts += [str(settings_to_dict(part)) for part in (config.surface, config.score)]
-    manifests = [outfit.path / "manifest.json" for outfit in config.outfits()]
-    parts += [_digest(path) for path in manifests if path.is_file()]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def tabulate_experiment(configs: Sequence[ExperimentConfig]) -> Path:

@@ -32,6 +32,13 @@ ORIGINAL = {  # counted in POP's own network at full size, codes apart
 }
 
 
+@dataclass
+class ParametersConfig:
+    """The table of every method's parameters at both sizes."""
+
+    out: Path = Path("runs/tables")  # where parameters.csv and parameters.md go
+
+
 @dataclass(frozen=True)
 class Count:
     """The parameters of one part of a method's network at one size; ``original`` those of the authors', if known."""

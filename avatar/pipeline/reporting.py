@@ -24,7 +24,7 @@ from avatar.geometry.trees import build_tree
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.pipeline.methods import load_avatar
-from avatar.pipeline.scores import floors_root, predictions_folder, read_all_scores, run_outfits
+from avatar.pipeline.scores import floors_root, predictions_folder, read_all_scores, read_floors, run_outfits
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.records import Frame, PointCloud
 from avatar.training.prediction import body_batch, garment_template_cloud, outfit_index, predict, template_samples
@@ -77,11 +77,11 @@ def report(config: ReportConfig) -> Path:
 
 def gather_scores(config: ReportConfig, avatar: TrainedAvatar) -> Scores:
     """The run's scores, those of the runs it is set against, and the floors, as far as they are there."""
-    settings = avatar.config
-    root = floors_root(config.run, settings)
-    floors = [root / "floors" / settings.dataset / name for name in settings.outfit]
-    paths = [folder / "scores.csv" for folder in (*floors, *config.against, config.run)]
-    return read_all_scores(path for path in paths if path.is_file())
+    settings, paths = avatar.config, [folder / "scores.csv" for folder in (*config.against, config.run)]
+    scores, root = read_all_scores(path for path in paths if path.is_file()), floors_root(config.run, settings)
+    for name in dict.fromkeys(row.outfit for row in scores.rows):
+        scores = read_floors(root, settings.dataset, name, scores.rows) + scores
+    return scores
 
 
 def headline_facts(avatar: TrainedAvatar, scores: Scores) -> dict[str, str]:
@@ -160,7 +160,9 @@ def template_pictures(avatar: TrainedAvatar, outfit: Outfit) -> list[PictureRow]
 
 def made_files(run: Path) -> tuple[Path, ...]:
     """What the run made: its files and, for folders of many, the folder."""
-    files = [path for path in sorted(run.iterdir()) if path.is_file() and path.name != "report.html"]
+    files = [
+        path for path in sorted(run.iterdir()) if path.is_file() and path.name != "report.html" and path.name[0] != "."
+    ]
     folders = sorted(
         {path.parent for kind in ("predictions", "meshes", "export") for path in (run / kind).rglob("*.*")}
     )

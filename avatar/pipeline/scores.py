@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
+import json
 import subprocess
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,19 +12,31 @@ from pathlib import Path
 from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
+from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.floors import score_body_floor, score_sampling_floor
-from avatar.evaluation.scores import Scores, read_scores, write_scores
-from avatar.evaluation.scoring import Label, ScoreConfig, find_predictions, score_predictions
+from avatar.evaluation.scores import Score, Scores, frames_path, read_scores, write_scores
+from avatar.evaluation.scoring import (
+    SOURCE,
+    Label,
+    ScoreConfig,
+    find_predictions,
+    remember_scores,
+    score_predictions,
+)
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.io.ledger import Ledger
+from avatar.io.documents import read_json
+from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.io.motions import read_body_motion
 from avatar.io.npz import write_whole
 from avatar.nn.decoders import Normals
 from avatar.pipeline.methods import is_implicit, load_avatar
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
+from avatar.training.locks import lock_folder
 from avatar.training.prediction import predict_frames, predict_motion
 from avatar.training.runs import RunConfig, TrainedAvatar
+
+MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
 
 
 @dataclass
@@ -107,35 +120,52 @@ def predict(config: PredictConfig) -> list[Path]:
         if is_implicit(avatar):
             meshes = meshes_folder(config.run, motion.name, outfit.name)
             options = {"points": config.points, "config": config.surface}
-            predict_implicit_motion(avatar, outfit, motion, folders[-1], meshes, **options)
+            written = predict_implicit_motion(avatar, outfit, motion, folders[-1], meshes, **options)
         else:
-            predict_motion(avatar, outfit, motion, folders[-1], config.points)
+            written = predict_motion(avatar, outfit, motion, folders[-1], config.points)
+        for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
+            path.unlink()  # the end of an earlier prediction with more frames a second
+        write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
     return folders
+
+
+def predicted_fps(folder: Path) -> float:
+    """The frames a second that a motion was predicted at; 30 for the frames of a split."""
+    path = folder / MOTION
+    return float(read_json(path)["fps"]) if path.is_file() else 30.0
 
 
 def evaluate(config: EvaluateConfig) -> Scores:
     """Scores runs, or a foreign program's predictions, beside their floors; prints the tables.
 
-    Each run's scores go to ``<run>/scores.csv``, the floors to ``<runs>/floors/<dataset>/<outfit>/scores.csv``; those
-    on another split than test to ``scores.<split>.csv``.
+    Each run's scores go to ``<run>/scores.csv``, the floors to `floors_folder`; those on another split than test to
+    ``scores.<split>.csv``. The ledger of each folder keeps what was measured: what is unchanged (predictions, data,
+    settings, and the code of the metrics) is not measured again.
     """
-    if config.predictions is not None:
-        outfit = find_outfit(config.data_root or Path("data"), config.dataset, config.outfit)
-        folder = config.out or config.predictions
-        label, done = Label(config.label), Ledger(folder)
-        scores = score_predictions(config.predictions, outfit, config.split, config.score, label, None, done)
-        write_scores(folder / "scores.csv", scores)
-        if config.floors:
-            scores = score_floors(outfit, config, 50_000, folder / "floors.csv") + scores
-    else:
-        scores = score_runs(config)
+    scores = score_runs(config) if config.predictions is None else score_foreign(config, config.predictions)
     print_tables(scores)
     return scores
 
 
+def score_foreign(config: EvaluateConfig, folder: Path) -> Scores:
+    """Scores a foreign program's folder of predictions, and its floors at as many points."""
+    outfit = find_outfit(config.data_root or Path("data"), config.dataset, config.outfit)
+    find_predictions(folder, outfit.frames(config.split))
+    out = config.out or folder
+    with lock_folder(out, wait=True):
+        ledger = Ledger(out)
+        scores = score_predictions(folder, outfit, config.split, config.score, Label(config.label), None, ledger)
+        save_scores(out / "scores.csv", scores, ledger, keyed(SOURCE))
+        floors = score_floors(outfit, config, scores.rows[0].points, out / "floors.csv") if config.floors else Scores()
+    return floors + scores
+
+
 def score_runs(config: EvaluateConfig) -> Scores:
-    """Scores every outfit of every run, and the floors once an outfit; refuses before it begins what is not there."""
-    scores, seen = Scores(), set()
+    """Scores every outfit of every run, and its floors at the point count that most of the runs predict.
+
+    Predictions that are missing are refused before anything is scored.
+    """
+    scores, floors = Scores(), {}
     avatars = {run: load_avatar(run) for run in config.runs}
     for run, avatar in avatars.items():
         for outfit in run_outfits(avatar, config.data_root):
@@ -151,18 +181,21 @@ def score_runs(config: EvaluateConfig) -> Scores:
             commit=current_commit(),
             fraction=settings.split.train_fraction,
         )
-        mine = Scores()
-        for outfit in run_outfits(avatar, config.data_root):
-            folder = predictions_folder(run, config.split, outfit.name)
-            meshes = meshes_folder(run, config.split, outfit.name) if is_implicit(avatar) else None
-            done = Ledger(run / "predictions")
-            mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes, done)
-            if config.floors and outfit.path not in seen:
-                seen.add(outfit.path)
-                path = floors_root(run, settings) / "floors" / settings.dataset / outfit.name
-                scores = scores + score_floors(outfit, config, mine.rows[-1].points, scores_file(path, config.split))
-        write_scores(scores_file(run, config.split), mine)
+        mine, outfits = Scores(), run_outfits(avatar, config.data_root)
+        with lock_folder(run / "predictions", wait=True):
+            ledger = Ledger(run)
+            for outfit in outfits:
+                folder = predictions_folder(run, config.split, outfit.name)
+                meshes = meshes_folder(run, config.split, outfit.name) if is_implicit(avatar) else None
+                mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes, ledger)
+            save_scores(scores_file(run, config.split), mine, ledger, keyed(SOURCE))
         scores = scores + mine
+        for outfit in outfits if config.floors else ():
+            points = next(row.points for row in mine.rows if row.outfit == outfit.name)
+            path = floors_folder(floors_root(run, settings), settings.dataset, outfit.name, points)
+            floors[outfit.name, points] = score_floors(outfit, config, points, scores_file(path, config.split))
+    for (name, points), found in floors.items():
+        scores = found + scores if points == common_points(scores.rows, name) else scores
     return scores
 
 
@@ -187,31 +220,53 @@ def floors_root(run: Path, settings: RunConfig) -> Path:
 
 
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
-    """The sampling floor and the bare body for one outfit, kept in a file for the next method.
+    """The sampling floor and the bare body for one outfit at a point count, kept in a file for the next method.
 
-    The file serves again when it was made with the same points, seed, scanner and data (by manifest); metrics that it
-    lacks are added to it.
+    Metrics that the file has already stay in it where they were made with the same points, seed, scanner, data and
+    code. Two processes that want the same floors score them once: the second waits for the first.
     """
-    beside = path.with_suffix(".settings.txt")
-    manifest = outfit.path / "manifest.json"
-    data = hashlib.sha256(manifest.read_bytes()).hexdigest() if manifest.is_file() else outfit.path.resolve()
-    draw = (config.score.scan_points, config.score.seed, config.score.motion)
-    key, wanted = f"{config.split} {points} {draw} {getattr(outfit, 'scanner', None)} {data}", config.score.metrics
-    kept, known = Scores(), []
-    if path.is_file() and beside.is_file():
-        made_with, _, names = beside.read_text().partition("\n")
-        if made_with == key:
-            kept, known = read_scores(path), names.split()
-    missing = [name for name in wanted if name not in known]
-    if missing:
-        made = {"points": points, "commit": current_commit(), "ledger": Ledger(path.parent)}
-        score = replace(config.score, metrics=missing)
-        kept = kept + score_sampling_floor(outfit, config.split, score, **made)
-        kept = kept + score_body_floor(outfit, config.split, score, **made)
-        beside.unlink(missing_ok=True)  # it never speaks of another file than the one beside it
-        write_scores(path, kept)
-        write_whole(beside, f"{key}\n{' '.join([*known, *missing])}".encode())
-    return kept.of_metrics(wanted)
+    memory = remember_scores(None, "floors", outfit, config.split, config.score, points=points)
+    key = digest_of([memory.made_of(name) for name in outfit.frames(config.split)])
+    with lock_folder(path.parent, wait=True):
+        ledger = Ledger(path.parent)
+        made = {"points": points, "commit": current_commit(), "ledger": ledger}
+        scores = score_sampling_floor(outfit, config.split, config.score, **made)
+        scores = scores + score_body_floor(outfit, config.split, config.score, **made)
+        kept = read_scores(path) if ledger.find(path.name, key) else Scores()
+        others = {row.metric for row in kept.rows} - set(config.score.metrics)
+        save_scores(path, kept.of_metrics(others) + scores, ledger, key)
+    return scores
+
+
+def floors_folder(root: Path, dataset: str, outfit: str, points: int) -> Path:
+    """Where an outfit's floors at a point count stand: ``<root>/floors/<dataset>/<outfit>/<points>``."""
+    return root / "floors" / dataset / outfit / str(points)
+
+
+def read_floors(root: Path, dataset: str, outfit: str, rows: Iterable[Score]) -> Scores:
+    """An outfit's floors at the point count that most of its methods in ``rows`` predict; none where none were made."""
+    path = floors_folder(root, dataset, outfit, common_points(rows, outfit)) / "scores.csv"
+    return read_scores(path) if path.is_file() else Scores()
+
+
+def common_points(rows: Iterable[Score], outfit: str) -> int:
+    """The point count that most of an outfit's methods predict; of two that as many have, the larger."""
+    methods = {(row.points, method_key(row), row.seed) for row in rows if row.outfit == outfit}
+    methods = {method for method in methods if base_method(method[1]) not in FLOORS[:2]}
+    counts = Counter(points for points, _, _ in methods)
+    return max(counts, key=lambda points: (counts[points], points))
+
+
+def save_scores(path: Path, scores: Scores, ledger: Ledger, key: str) -> None:
+    """Writes scores, and notes in the ledger of their folder by what they were made, unless it says the same."""
+    write_scores(path, scores)
+    if ledger.find(path.name, key) is None:
+        ledger.record(path.name, key, [file for file in (path, frames_path(path)) if file.is_file()])
+
+
+def are_current(path: Path) -> bool:
+    """Whether a file of scores of predictions is as `evaluate` wrote it, with the metrics' code as it is now."""
+    return Ledger(path.parent).find(path.name, keyed(SOURCE)) is not None
 
 
 def print_tables(scores: Scores) -> None:

@@ -32,7 +32,7 @@ class SeamsConfig:
     frames: int | None = None  # this many of the split, evenly spaced; all of them if null
     seed: int = 0
     data_root: Path | None = None  # where the data are now; where they were at training if null
-    out: Path = Path("docs/results")
+    out: Path = Path("runs/tables")  # where the table's files go
 
     def __post_init__(self):
         check_name("table", self.table)
@@ -63,7 +63,7 @@ def seams(config: SeamsConfig) -> Path:
         tables += [seam_differences(mine, config.baseline)] if config.baseline else []
     text = "\n".join(map(to_markdown, tables))
     write_whole(config.out / f"{config.table}.md", text.encode())
-    print(text)
+    print(f"{text}\nwritten: {config.out / config.table}.*")
     return config.out / f"{config.table}.md"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_body_motion
 from avatar.io.points import read_points
 from avatar.pipeline.methods import is_implicit, load_avatar
-from avatar.pipeline.scores import meshes_folder, predictions_folder, run_outfits
+from avatar.pipeline.scores import meshes_folder, predicted_fps, predictions_folder, run_outfits
 
 
 @dataclass
@@ -37,7 +38,7 @@ class ExportConfig:
 
     run: Path = Path("runs/closet/sample/dress/default")
     predictions: str = "walk"  # the motion that was predicted
-    fps: float = 30.0
+    fps: float | None = None  # frames a second; those that a motion was predicted at if null, 30 for frames of a split
     motion: Path | None = None  # the motion's file, for the rigged body's joint tracks
     up: str | None = None  # y or z, which axis of the motion's file points up; its format's own if null
     data_root: Path | None = None  # where the data are now; where they were at training if null
@@ -81,31 +82,63 @@ def spaced_frames(names: list[str], count: int | None) -> list[str]:
 def export(config: ExportConfig) -> list[Path]:
     """Writes ``<run>/export/<motion>/<outfit>/{points.usdc, meshes.usdc, body.glb, preview.webp}``.
 
-    Meshes are there when the sequence was meshed, joint tracks when its motion file is given.
+    Meshes are there when the sequence was meshed, joint tracks when its motion file is given. Frames are shown at the
+    times of their numbers. Several sequences (those of a split) have a folder each, ``<outfit>/<sequence>``.
     """
     avatar, written = load_avatar(config.run), []
     outfits = list(run_outfits(avatar, config.data_root))
     bodies = [outfit.body for outfit in outfits]
-    motions = [
-        read_body_motion(config.motion, body, config.fps, config.up) if config.motion and body is not None else None
-        for body in bodies
+    rates = [
+        config.fps or predicted_fps(predictions_folder(config.run, config.predictions, outfit.name))
+        for outfit in outfits
     ]
-    for outfit, body, motion in zip(outfits, bodies, motions):
+    motions = [
+        read_body_motion(config.motion, body, fps, config.up) if config.motion and body is not None else None
+        for body, fps in zip(bodies, rates)
+    ]
+    for outfit, body, fps, motion in zip(outfits, bodies, rates, motions):
         folder = predictions_folder(config.run, config.predictions, outfit.name)
-        paths = sorted(folder.glob("*.ply"))
-        if not paths:
+        meshes = meshes_folder(config.run, config.predictions, outfit.name)
+        sequences = numbered_frames(path.stem for path in folder.glob("*.ply"))
+        if not sequences:
             raise DataError(folder, "no predictions here.", "Run tools/predict.py first.")
         target = config.run / "export" / config.predictions / outfit.name
-        write_usd_points(target / "points.usdc", (read_points(path) for path in paths), config.fps)
-        camera = frame_camera(read_points(paths[0]).points, "three_quarter", margin=0.2)
-        images = [render_points(read_points(path), camera) for path in paths]
-        write_animation(target / "preview.webp", images, config.fps)
-        written += [target / "points.usdc", target / "preview.webp"]
-        meshes = sorted((config.run / "meshes" / config.predictions / outfit.name).glob("*.ply"))
-        if meshes:
-            write_usd_meshes(target / "meshes.usdc", (read_mesh(path) for path in meshes), config.fps)
-            written.append(target / "meshes.usdc")
+        for name, frames in sequences.items():
+            place = target if len(sequences) == 1 else target / check_name("sequence", name)
+            written += export_sequence(folder, meshes, frames, fps, place)
         if body is not None:
             write_rigged_glb(target / "body.glb", body, motion)
             written.append(target / "body.glb")
     return written
+
+
+def numbered_frames(names: Iterable[str]) -> dict[str, dict[int, str]]:
+    """Frames ``<sequence>.<number>`` as sequence, number and name, each in order; those without a number are counted.
+
+    Raises:
+        AvatarError: when two frames of a sequence have one number.
+    """
+    sequences: dict[str, dict[int, str]] = {}
+    for place, name in enumerate(sorted(names)):
+        sequence, _, digits = name.rpartition(".")
+        frames = sequences.setdefault((digits.isdecimal() and sequence) or "frames", {})
+        number = int(digits) if digits.isdecimal() else place
+        if number in frames:
+            raise AvatarError(f"predictions: expected one frame a number, got {frames[number]} and {name}.")
+        frames[number] = name
+    return {sequence: dict(sorted(frames.items())) for sequence, frames in sequences.items()}
+
+
+def export_sequence(folder: Path, meshes: Path, frames: dict[int, str], fps: float, target: Path) -> list[Path]:
+    """Writes the points, the preview and, where there are any, the meshes of one sequence; gives the files."""
+    clouds = {number: folder / f"{name}.ply" for number, name in frames.items()}
+    write_usd_points(target / "points.usdc", map(read_points, clouds.values()), fps, list(clouds))
+    camera = frame_camera(read_points(clouds[min(clouds)]).points, "three_quarter", margin=0.2)
+    images = [render_points(read_points(path), camera) for path in clouds.values()]
+    write_animation(target / "preview.webp", images, fps, list(clouds))
+    surfaces = {number: meshes / f"{name}.ply" for number, name in frames.items()}
+    surfaces = {number: path for number, path in surfaces.items() if path.is_file()}
+    if surfaces:
+        write_usd_meshes(target / "meshes.usdc", map(read_mesh, surfaces.values()), fps, list(surfaces))
+    written = [target / name for name in ("points.usdc", "preview.webp")]
+    return written + ([target / "meshes.usdc"] if surfaces else [])

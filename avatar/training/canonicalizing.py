@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
-import json
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -30,7 +28,7 @@ from avatar.data.streaming import Streamed
 from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
 from avatar.io.canonical_scans import write_canonical_scan
-from avatar.io.ledger import Ledger, digest_of
+from avatar.io.ledger import Ledger, digest_of, file_digest, keyed, module_digest
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
 from avatar.progress import tracked
@@ -43,6 +41,8 @@ from avatar.training.distributed import refuse_team
 from avatar.training.runs import save_settings
 
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
+# What makes canonical scans of trained weights, beside this module; how these were trained shows in the weights.
+SOURCE = ("avatar.canonical.scans", "avatar.canonical.rivals", "avatar.training.cycles", "avatar.data.layouts")
 CHUNK = 20_000  # points asked about at once, or fewer where memory runs out
 POSES = "learned_poses"
 FRAMES_ROOM = 128 << 20  # bytes of whole frames kept; what is learned from them is kept by itself
@@ -213,14 +213,14 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
     """
     frames = frames or config.frames()
     template = frames.outfits[0].template
-    source, stamp = skinning_source(config, template), stamp_of(config)
+    source, made_by = skinning_source(config, template), scans_digest(config)
     done = Ledger(config.folder / "scans")
     written = []
     for index, where in enumerate(tracked(frames.names, "canonicalize", unit="scan")):
         path = config.folder / "scans" / where.split / f"{where.name}.npz"
         written.append(path)
         made_of = frames.outfits[where.outfit].digest(where.split, where.name)
-        name, key = f"{where.split}/{where.name}", digest_of({"stamp": stamp, "frame": made_of})
+        name, key = f"{where.split}/{where.name}", digest_of({"canonicalizer": made_by, "frame": made_of})
         if done.find(name, key):
             continue
         frame = frames.frame(index)
@@ -230,7 +230,7 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
         if where.split == "train":
             files.append(path.with_suffix(".ply"))
             write_surface(files[-1], scan)
-        write_canonical_scan(path, scan, stamp)
+        write_canonical_scan(path, scan)
         done.record(name, key, files)
     return written
 
@@ -242,13 +242,13 @@ def skinning_source(config: CanonicalizeConfig, template: Template) -> SkinningS
     return NearestBody(template, KNN if config.weights is Skinning.knn else 1)
 
 
-def stamp_of(config: CanonicalizeConfig) -> str:
-    """A hash of all that a run's canonical scans depend on but the data: weights, scanner and cut."""
+def scans_digest(config: CanonicalizeConfig) -> str:
+    """One hash over all that a run's canonical scans depend on but the data: weights, scanner, cut and code."""
     plain = settings_to_dict(config)
     parts = {key: plain[key] for key in ("weights", "scan", "stretch")}
     if config.weights is Skinning.learned:
-        parts["learned"] = hashlib.sha256((config.folder / f"{WEIGHTS}.safetensors").read_bytes()).hexdigest()
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        parts["learned"] = file_digest(config.folder / f"{WEIGHTS}.safetensors")
+    return keyed(SOURCE, program=module_digest(__name__), **parts)
 
 
 def write_surface(path: Path, scan: CanonicalScan) -> None:

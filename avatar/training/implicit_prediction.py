@@ -21,6 +21,8 @@ from avatar.settings import settings_to_dict
 from avatar.training.prediction import avatar_digest, check_count, pose_digest
 from avatar.training.runs import TrainedAvatar
 
+SOURCE = ("avatar.training.implicit_prediction",)  # what makes predictions, the fields and readers of data included
+
 
 def write_frame(
     avatar: TrainedAvatar,
@@ -72,7 +74,7 @@ def predict_implicit_frames(
     for name in tracked(names, f"predict {outfit.name}"):
         written.append(clouds / f"{name}.ply")
         made = {"points": points, "surface": settings_to_dict(config), "body": outfit.digest(split, name)}
-        key = keyed(avatar=made_by, **made)
+        key = keyed(SOURCE, avatar=made_by, **made)
         if not done.find(name, key):
             write_frame(avatar, outfit.load(split, name).body, name, clouds, meshes, points, config)
             done.record(name, key, [written[-1], meshes / f"{name}.ply"])
@@ -96,7 +98,7 @@ def predict_implicit_motion(
         name = f"{motion.name}.{frame:05d}"
         written.append(clouds / f"{name}.ply")
         made = {"points": points, "surface": settings_to_dict(config), "body": pose_digest(outfit, motion, frame)}
-        key = keyed(avatar=made_by, **made)
+        key = keyed(SOURCE, avatar=made_by, **made)
         if not done.find(name, key):
             body = outfit.fit_pose(motion.poses[frame], motion.translations[frame])
             write_frame(avatar, body, name, clouds, meshes, points, config)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import logging
 import os
@@ -15,9 +13,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from avatar.checks import AvatarError, DataError
+from avatar.io.file_locks import lock_file
 
 LOCK = "run.lock"
-NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)  # Lustre and NFS mounts without locks
 HELD: dict[Path, int] = {}  # folders this process has locked, and the thread that did
 report = logging.getLogger(__name__)
 
@@ -60,15 +58,13 @@ def _open_lock(folder: Path) -> BinaryIO:
 def _take(file: BinaryIO, folder: Path, wait: bool) -> None:
     """Locks an open file, or refuses, and writes down who holds it."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        locked = lock_file(file, wait)
     except BlockingIOError:
         raise AvatarError(
             f"{folder}: another job is at work here ({_holder(file)}). "
             "Wait for it, stop it, or give this run another name (name=...)."
         ) from None
-    except OSError as error:
-        if error.errno not in NO_LOCKS:
-            raise
+    if not locked:
         report.warning("%s: this file system has no locks; take care that one job alone works here.", folder)
         return
     try:

@@ -20,6 +20,7 @@ from avatar.records import Batch, BodyFit, Motion, PointCloud, Prediction, Surfa
 from avatar.settings import settings_to_dict
 from avatar.training.runs import TrainedAvatar
 
+SOURCE = ("avatar.training.prediction",)  # what makes predictions, networks and readers of data included
 MAX_POINTS = 400_000
 CHUNK = 100_000  # points decoded at once, or fewer where memory runs out; the network is pointwise
 
@@ -111,7 +112,7 @@ def predict_frames(
     written, done, made_by = [], Ledger(folder), avatar_digest(avatar)
     for name in tracked([n for n in outfit.frames(split) if keep(n)], f"predict {outfit.name}"):
         written.append(folder / f"{name}.ply")
-        key = keyed(avatar=made_by, points=points, body=outfit.digest(split, name))
+        key = keyed(SOURCE, avatar=made_by, points=points, body=outfit.digest(split, name))
         if not done.find(name, key):
             batch = body_batch([outfit.load(split, name).body], index, (name,))
             write_points(written[-1], predict(avatar.model, batch, samples))
@@ -152,7 +153,7 @@ def predict_motion(avatar: TrainedAvatar, outfit: Outfit, motion: Motion, folder
     for frame in tracked(range(len(motion.poses)), f"predict {motion.name}"):
         name = f"{motion.name}.{frame:05d}"
         written.append(folder / f"{name}.ply")
-        key = keyed(avatar=made_by, points=points, body=pose_digest(outfit, motion, frame))
+        key = keyed(SOURCE, avatar=made_by, points=points, body=pose_digest(outfit, motion, frame))
         if not done.find(name, key):
             body = outfit.fit_pose(motion.poses[frame], motion.translations[frame])
             write_points(written[-1], predict(avatar.model, body_batch([body], index, (name,)), samples))

@@ -67,6 +67,70 @@ def test_meshes_may_change_their_triangles(tmp_path):
         np.testing.assert_allclose(np.array(prim.GetDisplayColorPrimvar().Get(frame)), mesh.colors, atol=1e-6)
 
 
+def samples_of(attribute):
+    """The first coordinate at each time sample."""
+    return {time: attribute.Get(time)[0][0] for time in attribute.GetTimeSamples()}
+
+
+@pytest.mark.parametrize("kind", ["points", "meshes"])
+def test_frames_stand_at_their_numbers_and_are_held_where_numbers_are_missing(tmp_path, kind):
+    """Frames 7, 8 and 12 of a sequence at 24 a second: nothing is blended over the gap."""
+    path, numbers = tmp_path / "a.usda", [7, 8, 12]
+    moved = [np.full((12, 3), shift, np.float32) + sphere(0).vertices for shift in (0, 1, 2)]
+    if kind == "points":
+        write_usd_points(path, (PointCloud(points, sphere(0).vertices) for points in moved), 24, numbers)
+    else:
+        write_usd_meshes(path, (Mesh(points, sphere(0).faces) for points in moved), 24, numbers)
+    stage = Usd.Stage.Open(str(path))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (7, 12)
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == 24
+    prim = UsdGeom.PointBased(stage.GetPrimAtPath(f"/avatar/{'points' if kind == 'points' else 'mesh'}"))
+    start = moved[0][0, 0]
+    expected = {7: 0, 8: 1, 11: 1, 12: 2}
+    assert samples_of(prim.GetPointsAttr()) == pytest.approx({t: start + shift for t, shift in expected.items()})
+    assert prim.GetPointsAttr().Get(9.5)[0][0] == pytest.approx(start + 1)  # as a program that blends shows it
+
+
+@pytest.mark.parametrize(
+    ("suffix", "fps", "durations"), [(".webp", 30, [33, 334, 300, 33]), (".gif", 30, [30, 340, 300, 30])]
+)
+def test_a_film_shows_each_picture_until_the_next_ones_time(tmp_path, suffix, fps, durations):
+    """Frames 4, 5, 15 and 24; 667 ms to the beginning of the last, whatever the ticks are rounded to."""
+    from PIL import Image
+
+    colors = [[250, 0, 0], [0, 250, 0], [0, 0, 250], [250, 250, 0]]
+    images = [np.full((32, 48, 3), color, np.uint8) for color in colors]
+    write_animation(tmp_path / f"a{suffix}", images, fps, [4, 5, 15, 24])
+    film, found = Image.open(tmp_path / f"a{suffix}"), []
+    for frame in range(film.n_frames):
+        film.seek(frame)
+        film.load()
+        found.append(film.info["duration"])
+    assert found == durations
+
+
+def test_films_do_not_run_fast_by_what_ticks_are_rounded(tmp_path):
+    from PIL import Image
+
+    pictures = [np.full((8, 8, 3), shade, np.uint8) for shade in range(0, 240, 4)]
+    write_animation(tmp_path / "a.gif", pictures, 60)  # 16.7 ms in steps of 10
+    film, length = Image.open(tmp_path / "a.gif"), 0
+    for frame in range(film.n_frames):
+        film.seek(frame)
+        length += film.info["duration"]
+    assert (film.n_frames, length) == (60, 1000)
+
+
+@pytest.mark.parametrize("frames", [[0, 1], [0, 1, 2, 3], [0, 2, 2], [0, 3, 1]])
+def test_numbers_that_do_not_fit_are_refused(tmp_path, frames):
+    picture = np.zeros((8, 8, 3), np.uint8)
+    with pytest.raises(AvatarError, match="frames: expected"):
+        write_usd_points(tmp_path / "a.usdc", [cloud(9)] * 3, 24, frames)
+    with pytest.raises(AvatarError, match="frames: expected"):
+        write_animation(tmp_path / "a.gif", [picture] * 3, 24, frames)
+    assert not list(tmp_path.iterdir())
+
+
 def test_bad_sequences_leave_nothing_behind(tmp_path):
     bad_points = cloud(9).points.copy()
     bad_points[0] = np.nan

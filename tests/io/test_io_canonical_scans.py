@@ -1,4 +1,4 @@
-"""Canonical scans on disk: what goes in comes out, stamps, and files that are refused."""
+"""Canonical scans on disk: what goes in comes out, and files that are refused."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatar.checks import AvatarError, DataError
-from avatar.io.canonical_scans import read_canonical_scan, read_stamp, write_canonical_scan
+from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import CanonicalScan
 
@@ -32,19 +32,18 @@ def whole_scan() -> CanonicalScan:
 @pytest.mark.parametrize("scan", [random_scan(), whole_scan()], ids=["points", "mesh"])
 def test_round_trip(tmp_path, scan):
     path = tmp_path / "walk.00012.npz"
-    write_canonical_scan(path, scan, "by hand")
+    write_canonical_scan(path, scan)
     back = read_canonical_scan(path)
     for name in ("points", "normals", "source", "faces", "colors"):
         assert np.array_equal(getattr(back, name), getattr(scan, name)), name
     np.testing.assert_allclose(back.weights, scan.weights, atol=3e-5)
     np.testing.assert_allclose(back.weights.sum(axis=1), 1, atol=1e-6)
     assert back.weights.dtype == np.float32 and back.source.dtype == np.int64
-    assert read_stamp(path) == "by hand"
 
 
 def test_equal_scans_give_equal_bytes(tmp_path):
     for name in ("a.npz", "b.npz"):
-        write_canonical_scan(tmp_path / name, whole_scan(), "s")
+        write_canonical_scan(tmp_path / name, whole_scan())
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
@@ -84,7 +83,6 @@ def test_unsound_files_are_refused_by_name(tmp_path, change, message):
     write_canonical_scan(path, random_scan())
     keys = {
         "format": "text ",
-        "stamp": "text ",
         "points": "float M 3",
         "normals": "float M 3",
         "weights": "uint16 J M",
@@ -103,6 +101,5 @@ def test_missing_and_damaged_files_are_refused(tmp_path):
         read_canonical_scan(path)
     write_canonical_scan(path, random_scan())
     path.write_bytes(path.read_bytes()[:-40])
-    for read in (read_canonical_scan, read_stamp):
-        with pytest.raises(DataError, match="sound"):
-            read(path)
+    with pytest.raises(DataError, match="sound"):
+        read_canonical_scan(path)

@@ -187,10 +187,10 @@ def test_each_frame_is_decoded_from_its_own_outfit_and_pose(template):
     config = replace(avatar().config, code_std=1.0, template=template)
     model = PopAvatar(ATLASED, 3, config).eval()
     batch, samples = replace(random_batch(), outfit_ids=torch.tensor([2, 1, 2])), template_points()
-    prediction, uv = model(batch, samples), model.atlas.place(samples)
+    prediction, look_up = model(batch, samples), model.atlas.look_up_at(samples)
     for frame, outfit in enumerate(batch.outfit_ids):
-        garment = model.garment_features(model.codes[None, outfit], uv)
-        pose = look_up(model.pose_encoder(model.atlas.position_map(batch.pose_vertices[None, frame])), uv)
+        garment = model.garment_features(model.codes[None, outfit], samples)
+        pose = look_up(model.pose_encoder(model.atlas.position_map(batch.pose_vertices[None, frame])))
         decoded = model.pose_decoder(torch.cat([pose, garment], dim=-1))
         offsets = decoded.offsets[0] * config.offset_scale
         if template:

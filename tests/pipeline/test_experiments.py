@@ -15,6 +15,7 @@ from tiny import SETTINGS, quick_training
 from avatar.checks import AvatarError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
+from avatar.evaluation import scoring
 from avatar.evaluation.forms import Axis, FormConfig, ReportedTable
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
@@ -52,7 +53,6 @@ def first(tiny_folder, tmp_path_factory) -> ExperimentConfig:
             baseline="static",
             reported=ReportedTable("a paper, table 9", ("POP",), {"CD": (7.34,)}),
             pictures=2,
-            out=folder / "results",
         ),
     )
 
@@ -78,22 +78,32 @@ def test_a_job_leaves_predictions_and_scores_with_what_tells_it_apart(jobs):
     }
 
 
-def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs):
-    run = jobs[1].run.folder
-    (run / "predictions" / "test" / "tiny" / "check.00000.ply").unlink()
-    weights, scores = (run / "avatar.safetensors").read_bytes(), (run / "scores.csv").stat().st_mtime_ns
-    experiment(jobs[1])
-    assert (run / "avatar.safetensors").read_bytes() == weights
-    assert (run / "scores.csv").stat().st_mtime_ns == scores
-    assert not (run / "predictions" / "test" / "tiny" / "check.00000.ply").is_file()
-    experiment(replace(jobs[1], score=replace(jobs[1].score, seed=5)))
-    assert (run / "scores.csv").stat().st_mtime_ns > scores
-    assert (run / "predictions" / "test" / "tiny" / "check.00000.ply").is_file()
-    experiment(jobs[1])
+def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatch, change_source):
+    run, drawn, real = jobs[1].run.folder, [], scoring.draw_scan
+    monkeypatch.setattr(scoring, "draw_scan", lambda frame, config: drawn.append(frame.name) or real(frame, config))
+    (run / "scored.txt").write_text("of an older version: not believed")
+
+    def again(job: ExperimentConfig) -> int:
+        """How many predictions the job scores."""
+        drawn.clear()
+        experiment(job)
+        return len(drawn)
+
+    cloud = run / "predictions" / "test" / "tiny" / "check.00000.ply"
+    before = {path: path.read_bytes() for path in (cloud, run / "avatar.safetensors", run / "scores.csv")}
+    cloud.unlink()
+    assert again(jobs[1]) == 0
+    assert before == {path: path.read_bytes() for path in before}
+    other = replace(jobs[1], score=replace(jobs[1].score, seed=5))
+    assert again(other) == 3 and (run / "scores.csv").read_bytes() != before[run / "scores.csv"]
+    assert again(jobs[1]) == 0
+    change_source("avatar.evaluation.closest")
+    assert again(jobs[1]) == 3 and again(jobs[1]) == 0
+    assert before == {path: path.read_bytes() for path in before}
 
 
 def test_the_table_has_every_form(jobs):
-    out = jobs[0].compare.out
+    out = jobs[0].runs_root / "tables"
     text = tabulate_experiment(jobs).read_text()
     assert "| metric | sampling | body | static | closet | closet (50%) |" in text
     assert "Equal steps: 4 each." in text and "Reported: a paper, table 9" in text and "excess over the" in text
@@ -168,13 +178,18 @@ def test_one_command_runs_all_jobs_names_the_failure_and_tables_the_rest(tiny_fo
         frame.write_bytes(frame.read_bytes()[:1000])
     options = "experiment=closet5 dataset=open outfit=one,two method=static train.steps=2 train.points=500 points=1000"
     options += " train.scan_points=500 train.batch=1 train.mirror=false score.scan_points=500 compare.baseline=static"
-    options += " compare.metrics=[cd_point] compare.pictures=0 compare.plots=false compare.out=out"
+    options += " compare.metrics=[cd_point] compare.pictures=0 compare.plots=false"
     line = [sys.executable, str(ROOT / "tools/experiment.py"), *options.split()]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    published = {path: path.stat().st_mtime_ns for path in (ROOT / "docs").rglob("*")}
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 2, done.stderr
     assert "2 jobs: 1 finished, 1 failed." in done.stderr and "Traceback" not in done.stderr
     failed = [line for line in done.stderr.splitlines() if line.startswith("  failed: ")]
     assert len(failed) == 1 and "outfit=two" in failed[0] and ".npz" in failed[0]
-    assert {row.method for row in read_scores(tmp_path / "out/closet5.csv").rows} == {"sampling", "body", "static"}
-    assert "Reported: CloSET, table 5" in (tmp_path / "out/closet5.md").read_text()
+    tables = tmp_path / "runs" / "tables"
+    assert {row.method for row in read_scores(tables / "closet5.csv").rows} == {"sampling", "body", "static"}
+    assert "Reported: CloSET, table 5" in (tables / "closet5.md").read_text()
+    assert "written: runs/tables/closet5.*" in done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == {"data", "runs"}
+    assert published == {path: path.stat().st_mtime_ns for path in published}  # not what this checkout publishes

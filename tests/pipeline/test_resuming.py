@@ -1,33 +1,41 @@
 """Long work goes on where it stopped: finished pieces are checked by hash and left, damaged ones are done again."""
 
 import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from avatar.checks import AvatarError, DataError
-from avatar.evaluation import scoring
+from avatar.evaluation import floors, scoring
+from avatar.evaluation.metrics import METRICS as METRIC_TABLE
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.export import meshing
 from avatar.export.meshing import PoissonConfig
-from avatar.pipeline import scores
-from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, floors_root, predict
+from avatar.io.points import read_points, write_points
+from avatar.pipeline.scores import (
+    EvaluateConfig,
+    PredictConfig,
+    are_current,
+    evaluate,
+    floors_folder,
+    floors_root,
+    predict,
+)
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
-from avatar.pipeline.torture.miniature import folder_of, prepare, train_job
+from avatar.pipeline.torture.miniature import folder_of, train_job
 from avatar.settings import settings_from_dict
 from avatar.training import prediction
 from avatar.training.checkpoints import save_checkpoint
 from avatar.training.runs import RunConfig, load_run
 
+ROOT = Path(__file__).parents[2]
 METRICS = ["cd_point", "normal_l1"]
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("resuming")
-    prepare(root)
-    return train_job("closet", root)
 
 
 @pytest.fixture
@@ -89,23 +97,104 @@ def test_predict_mesh_and_evaluate_do_what_is_missing_or_damaged_and_nothing_els
     capsys.readouterr()
 
 
-def test_floors_keep_the_metrics_of_earlier_tables(run, count, capsys):
-    """Two tables of one outfit ask for other metrics; neither may take the other's floors away."""
+def test_scores_are_made_again_when_a_metric_or_a_prediction_changes_and_not_else(
+    run, count, monkeypatch, change_source, capsys
+):
+    """A fixed metric must not keep its old numbers, and a change elsewhere must not cost a day of scoring."""
     predict(PredictConfig(run=run, points=1500, device="cpu"))
-    calls = count(scores, "score_sampling_floor")
+    config = EvaluateConfig(runs=(run,), score=ScoreConfig(scan_points=300, metrics=METRICS))
+    before = {(row.method, row.metric): row.value for row in evaluate(config).rows}
+    calls = count(scoring, "draw_scan"), count(floors, "draw_scan")
 
-    def floors(metrics: list[str], seed: int = 0) -> tuple[set[str], set[str]]:
+    def again() -> tuple[int, int]:
+        """How many predictions and floors a call scores."""
+        for made in calls:
+            made.clear()
+        evaluate(config)
+        return len(calls[0]), len(calls[1])
+
+    change_source("avatar.evaluation.plots")
+    change_source("avatar.pipeline.experiments")
+    assert again() == (0, 0) and are_current(run / "scores.csv")
+    change_source("avatar.evaluation.metrics")
+    real = METRIC_TABLE["cd_point"]
+    monkeypatch.setitem(METRIC_TABLE, "cd_point", replace(real, measure=lambda c: 2 * real.measure(c)))
+    assert not are_current(run / "scores.csv")
+    assert again() == (2, 4) and again() == (0, 0)  # two frames; two floors of each
+    after = {(row.method, row.metric): row.value for row in evaluate(config).rows}
+    assert after == {key: value * (2 if key[1] == "cd_point" else 1) for key, value in before.items()}
+    assert after["closet", "cd_point"] in {row.value for row in read_scores(run / "scores.csv").rows}
+    cloud = min((run / "predictions" / "test").rglob("*.ply"))
+    points = read_points(cloud)
+    write_points(cloud, replace(points, points=points.points + np.float32(0.01)))
+    assert again() == (1, 0)
+    capsys.readouterr()
+
+
+def test_floors_keep_the_metrics_and_the_point_counts_of_earlier_tables(run, count, capsys):
+    """Tables of one outfit ask for other metrics, and methods for other point counts: none takes another's away."""
+    counted = count(floors, "draw_scan")
+
+    def ask(metrics: list[str], points: int = 1500, seed: int = 0) -> tuple[set[str], set[str], int]:
+        counted.clear()
+        predict(PredictConfig(run=run, points=points, device="cpu"))
         config = EvaluateConfig(runs=(run,), score=ScoreConfig(scan_points=400, metrics=metrics, seed=seed))
         shown = {row.metric for row in evaluate(config).rows if row.method in ("sampling", "body")}
-        (file,) = (run.parents[3] / "floors").rglob("scores.csv")
-        return shown, {row.metric for row in read_scores(file).rows}
+        file = floors_folder(run.parents[3], "open", run.parent.name, points) / "scores.csv"
+        assert {row.points for row in read_scores(file).rows} == {points}
+        return shown, {row.metric for row in read_scores(file).rows}, len(counted)
 
-    assert floors(["cd_point"]) == ({"cd_point"}, {"cd_point"})
-    assert floors(["normal_l1", "cd_point"]) == ({"normal_l1", "cd_point"}, {"normal_l1", "cd_point"})
-    assert floors(["cd_point"]) == ({"cd_point"}, {"normal_l1", "cd_point"})
-    assert len(calls) == 2
-    assert floors(["cd_point"], seed=1) == ({"cd_point"}, {"cd_point"})
+    both = {"normal_l1", "cd_point"}
+    assert ask(["cd_point"]) == ({"cd_point"}, {"cd_point"}, 4)
+    assert ask(["normal_l1", "cd_point"]) == (both, both, 4)  # the second metric alone
+    assert ask(["cd_point"]) == ({"cd_point"}, both, 0)
+    assert ask(["cd_point"], points=1444) == ({"cd_point"}, {"cd_point"}, 4)
+    assert ask(["normal_l1", "cd_point"]) == (both, both, 0)
+    assert ask(["cd_point"], seed=1) == ({"cd_point"}, {"cd_point"}, 4)
+    assert ask(["cd_point"]) == ({"cd_point"}, {"cd_point"}, 0)
     capsys.readouterr()
+
+
+FLOORS_JOB = """
+import sys, time
+from pathlib import Path
+from avatar.data.layouts import find_outfit
+from avatar.data.scanner import ScanConfig
+from avatar.evaluation.scoring import ScoreConfig
+from avatar.pipeline import scores
+metric, root = sys.argv[1], Path(sys.argv[2])
+outfit = find_outfit(root / "data", "open", sys.argv[3], ScanConfig(points=500))
+real = scores.save_scores
+def late(*arguments):
+    (root / metric).touch()  # waits for the other job to have read the file, as long as one may have to
+    end = time.monotonic() + 3
+    while time.monotonic() < end and len(list(root.glob("*_*"))) < 2:
+        time.sleep(0.01)
+    real(*arguments)
+scores.save_scores = late
+config = scores.EvaluateConfig(score=ScoreConfig(scan_points=300, metrics=[metric]))
+print("ready", flush=True)
+sys.stdin.readline()
+scores.score_floors(outfit, config, 500, root / "floors" / "scores.csv")
+"""
+
+
+def test_two_processes_that_score_the_same_floors_at_once_lose_nothing(tiny_folder, tmp_path):
+    (tmp_path / "data").symlink_to(tiny_folder.parents[1])
+    metrics = ("cd_point", "normal_l1")
+    lines = [[sys.executable, "-c", FLOORS_JOB, metric, str(tmp_path), tiny_folder.name] for metric in metrics]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    jobs = [subprocess.Popen(line, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, **pipes) for line in lines]
+    assert [job.stdout.readline() for job in jobs] == ["ready\n"] * 2
+    for job in jobs:
+        job.stdin.write("go\n")
+        job.stdin.flush()
+    for job in jobs:
+        job.communicate(timeout=300)
+        assert job.returncode == 0
+    found = read_scores(tmp_path / "floors" / "scores.csv")
+    assert {(row.method, row.metric) for row in found.rows} == {(m, n) for m in ("sampling", "body") for n in metrics}
+    assert len(found.frames) == 4 * 3  # three frames
 
 
 def test_what_a_foreign_run_says_of_its_root_is_not_believed(run, tmp_path):

@@ -19,12 +19,13 @@ from avatar.canonical.posed import DrawConfig, prepare_scan, to_root_frame
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset
 from avatar.data.scanner import ScanConfig
+from avatar.evaluation.canonical_scores import CANONICAL_METRICS
 from avatar.evaluation.scores import read_scores
 from avatar.geometry.transforms import transform_points
-from avatar.io.canonical_scans import read_canonical_scan, read_stamp
+from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
-from avatar.pipeline.canonicalization import canonicalize, carrier, weight_colors
+from avatar.pipeline.canonicalization import canonicalize, carrier, score_canonical_scans, weight_colors
 from avatar.training.canonicalizing import (
     CanonicalizeConfig,
     Skinning,
@@ -279,7 +280,9 @@ def test_the_trained_field_comes_back_differentiable_and_frozen(settings, folder
     assert not any(parameter.requires_grad for parameter in trained.forward_field.parameters())
 
 
-def test_finished_scans_are_left_alone_and_damaged_or_outdated_ones_made_again(settings, folder, monkeypatch):
+def test_finished_scans_are_left_alone_and_damaged_or_outdated_ones_made_again(
+    settings, folder, monkeypatch, change_source
+):
     files = sorted((folder / "scans").rglob("*.npz"))
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
     monkeypatch.setattr(cycles.CycleTrainer, "fit", lambda self: pytest.fail("trained again"))
@@ -290,9 +293,15 @@ def test_finished_scans_are_left_alone_and_damaged_or_outdated_ones_made_again(s
     damaged.write_bytes(before[damaged][1][:-30])
     assert len(canonicalize_frames(settings)) == len(files)
     assert damaged.read_bytes() == before[damaged][1]  # the same bits again
-    monkeypatch.setattr("avatar.training.canonicalizing.stamp_of", lambda config: "newer")
+    before = {path: path.stat().st_mtime_ns for path in files}
+    change_source("avatar.training.loop")  # has no part in scans of weights that are trained
     canonicalize_frames(settings)
-    assert {read_stamp(path) for path in files} == {"newer"}
+    assert all(path.stat().st_mtime_ns == before[path] for path in files)
+    for module in ("avatar.canonical.scans", "avatar.training.canonicalizing"):
+        change_source(module)
+        canonicalize_frames(settings)
+        assert all(path.stat().st_mtime_ns > before[path] for path in files)
+        before = {path: path.stat().st_mtime_ns for path in files}
 
 
 def test_going_on_with_other_settings_is_refused(settings, folder):
@@ -341,6 +350,32 @@ def test_a_run_is_scored_against_the_truth_beside_its_rivals(settings, folder):
     back = carrier(settings, skinning_source(settings, read_template(folder / "template.npz")))(frame)
     assert np.allclose(back.forward_weights.sum(axis=1), 1, atol=1e-5)
     assert "| truth_cm (cm) |" in (folder / "scores.md").read_text()
+
+
+def test_canonical_scores_are_measured_again_when_their_code_or_the_scans_change_and_not_else(
+    settings, monkeypatch, change_source
+):
+    """As `experiment` asks for them, again and again; a fixed metric must not keep its old numbers."""
+    config, measured, found = replace(settings, weights=Skinning.knn, name="scored", pictures=0, scored=1), [], []
+    frames, real = config.frames(), CANONICAL_METRICS["truth_cm"].measure
+
+    def count(factor: float) -> int:
+        """The measurements that a call makes, with a metric that gives ``factor`` times the true one's number."""
+        fixed = replace(CANONICAL_METRICS["truth_cm"], measure=lambda c: measured.append(1) or factor * real(c))
+        monkeypatch.setitem(CANONICAL_METRICS, "truth_cm", fixed)
+        measured.clear()
+        rows = [row for row in score_canonical_scans(config, frames).rows if row.metric == "truth_cm"]
+        found.append({(row.method, row.variant): row.value for row in rows})
+        return len(measured)
+
+    assert [count(1), count(1)] == [6, 0]  # two splits of a frame, two rivals and the true weights
+    change_source("avatar.evaluation.canonical_scores")
+    assert [count(2), count(2)] == [6, 0]
+    assert found[0] == found[1] != found[2] == {method: 2 * value for method, value in found[0].items()}
+    written = read_scores(config.folder / "scores.csv").rows
+    assert {row.value for row in written if row.metric == "truth_cm"} == set(found[2].values())
+    config = replace(config, stretch=2.0)
+    assert count(2) == 4  # not of the true weights, which cut nothing
 
 
 def test_bad_settings_are_refused_by_name(settings):

@@ -58,7 +58,7 @@ class BenchConfig:
     memory: bool = True  # also each contender's peak memory, in a process of its own
     avatars: dict[str, dict[str, Any]] = field(default_factory=lambda: {"closet_full": {}, "pop_full": {}})
     canonicalizers: dict[str, dict[str, Any]] = field(default_factory=lambda: {"full": {}})
-    out: Path = Path("docs/results")
+    out: Path = Path("runs/tables")  # where the table's files go
     table: str = "bench"  # the name of the table's files
     device: str = "auto"
 
@@ -91,7 +91,7 @@ def bench(config: BenchConfig) -> Path:
     write_scores(path, scores)
     text = to_markdown(scores.rows)
     write_whole(path.with_suffix(".md"), text.encode())
-    print(text)
+    print(f"{text}\nwritten: {config.out / config.table}.*")
     return path.with_suffix(".md")
 
 

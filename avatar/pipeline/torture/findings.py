@@ -46,7 +46,7 @@ def none_of(trial: str, what: str, count: int, cases: int) -> Finding:
 
 
 def to_score(finding: Finding, seed: int, seconds: float, commit: str) -> Score:
-    """A finding as a row of docs/results/reliability.csv; ``method`` is the trial, ``frames`` its cases."""
+    """A finding as a row of reliability.csv; ``method`` is the trial, ``frames`` its cases."""
     return Score(
         table="reliability",
         outfit="",

@@ -219,7 +219,7 @@ def make_canonical_scan(folder: Path) -> Path:
     normals = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
     weights /= weights.sum(axis=1, keepdims=True)
     scan = CanonicalScan(mesh.vertices, normals, weights, np.arange(42), mesh.faces, mesh.colors)
-    write_canonical_scan(folder / "scan.npz", scan, "stamp")
+    write_canonical_scan(folder / "scan.npz", scan)
     return folder / "scan.npz"
 
 

@@ -55,7 +55,7 @@ class TortureConfig:
     seed: int = 0
     again: bool = False  # do finished trials of the same size again
     root: Path = Path("runs/torture")  # where to work; emptied trial by trial
-    out: Path = Path("docs/results")
+    out: Path = Path("runs/tables")  # where the table's files go
     table: str = "reliability"  # name of the table's files there
 
     def __post_init__(self):
@@ -131,6 +131,7 @@ def write_table(config: TortureConfig) -> Path:
     write_scores(config.out / f"{config.table}.csv", Scores(rows))
     path = config.out / f"{config.table}.md"
     write_whole(path, to_table(findings).encode())
+    print(f"written: {config.out / config.table}.*")
     missed = [finding for finding in findings if not finding.met]
     if missed:
         first = missed[0]
