@@ -9,7 +9,7 @@ from wearers import BodyField, SmoothField, posed_batch, vertex_samples
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
-from avatar.geometry.surface import interpolate, sample_surface
+from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.nn.closet import ClosetAvatar, ClosetConfig, PoseLocality, Skinning
 from avatar.nn.decoders import Decoded
@@ -83,7 +83,7 @@ def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
     model = ClosetAvatar(TEMPLATE, 3, small_config(code_std=1.0)).eval()
     batch, samples = replace(random_batch(), outfit_ids=torch.tensor([2, 1, 2])), template_points()
     prediction = model(batch, samples)
-    scale, skin = model.config.offset_scale, interpolate(model.skin_normals, samples)
+    scale, skin = model.config.offset_scale, vertex_normals(TEMPLATE.vertices, TEMPLATE.faces)
     for frame, outfit in enumerate(batch.outfit_ids):
         garment = model.surface_features(model.codes[None, outfit], samples)
         torch.testing.assert_close(garment[0, :, -3:], interpolate(TEMPLATE.vertices, samples))
@@ -96,7 +96,8 @@ def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
         }
         for name, value in expected.items():
             torch.testing.assert_close(getattr(prediction, name)[frame], value[0], rtol=1e-4, atol=1e-6)
-        added = (skin + template.normals + wrinkles.normals)[0] @ batch.vertex_transforms[frame, 0, :3, :3].T
+        added = interpolate(skin, samples) + template.normals[0] + wrinkles.normals[0]
+        added = added @ batch.vertex_transforms[frame, 0, :3, :3].T
         torch.testing.assert_close(prediction.normals[frame], torch.nn.functional.normalize(added, dim=-1))
     torch.testing.assert_close(prediction.codes, model.codes[1:])  # each outfit of the batch once
 

@@ -66,19 +66,19 @@ def test_rates_of_the_code_fall_for_the_second_half(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def wardrobe(tmp_path_factory) -> Path:
+def garments(tmp_path_factory) -> Path:
     """A data folder: one garment in three widths, the third like the second."""
-    root = tmp_path_factory.mktemp("wardrobe")
+    root = tmp_path_factory.mktemp("garments")
     for name, ease in (("tight", 0.005), ("wide", 0.06), ("unseen", 0.055)):
         write_tiny_outfit(root / "open" / name, ease)
     return root
 
 
 @pytest.fixture(scope="module")
-def settings(wardrobe, tmp_path_factory) -> FitConfig:
+def settings(garments, tmp_path_factory) -> FitConfig:
     """Of fitting the third garment with a network that has learned the others."""
     train = quick_training(steps=80, points=1500, scan_points=1500, validate_every=1000)
-    where = {"dataset": "open", "data_root": wardrobe, "runs_root": tmp_path_factory.mktemp("runs")}
+    where = {"dataset": "open", "data_root": garments, "runs_root": tmp_path_factory.mktemp("runs")}
     choice = MethodChoice("closet", "closet", SETTINGS)
     run = train_run(RunConfig(choice, outfit=("tight", "wide"), train=train, split=SplitConfig(0.0), **where))
     loss = LossConfig(normal_start=0.0, offset=20)

@@ -8,15 +8,35 @@ import torch
 from scipy.spatial import cKDTree
 from tiny import SETTINGS, quick_training
 
+from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError
 from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
-from avatar.data.splits import SplitConfig
+from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.io.points import read_points
+from avatar.nn.closet import ClosetConfig
+from avatar.settings import settings_from_dict
 from avatar.simulate.sequences import authored_motion
+from avatar.training.checkpoints import save_checkpoint
 from avatar.training.loop import Trainer
-from avatar.training.prediction import body_batch, predict, predict_frames, predict_motion, template_samples
-from avatar.training.runs import MethodChoice, RunConfig, load_run, train_run
+from avatar.training.prediction import (
+    body_batch,
+    outfit_index,
+    predict,
+    predict_frames,
+    predict_motion,
+    template_samples,
+)
+from avatar.training.runs import (
+    MethodChoice,
+    RunConfig,
+    TrainedAvatar,
+    choose_weights,
+    fresh_avatar,
+    load_run,
+    mean_template,
+    train_run,
+)
 
 POSE = ("pose_vertices", "vertices", "vertex_transforms", "joint_transforms")
 TENSORS = (*POSE, "scan_points", "scan_normals", "outfit_ids")
@@ -115,7 +135,8 @@ def test_a_mirroring_run_learns_from_half_of_its_frames_in_a_mirror(settings, ti
 
     monkeypatch.setattr(Trainer, "fit", note)
     for mirror in (False, True):
-        train_run(replace(settings, name=f"mirror-{mirror}", train=replace(settings.train, mirror=mirror, seed=2)))
+        train = replace(settings.train, mirror=mirror, seed=2, scan_points=1000)
+        train_run(replace(settings, name=f"mirror-{mirror}", train=train))
     symmetry, coins = mirror_map(tiny_outfit.template), [mirror_coins(2, step, 2) for step in range(6)]
     assert 3 <= sum(map(sum, coins)) <= 9
     for before, after, chosen in zip(*(drawn[mirror][0] for mirror in (False, True)), coins, strict=True):
@@ -126,6 +147,38 @@ def test_a_mirroring_run_learns_from_half_of_its_frames_in_a_mirror(settings, ti
                 assert torch.equal(getattr(after, field)[row], getattr(image if turned else before, field)[row]), field
     for before, after in zip(drawn[False][1], drawn[True][1], strict=True):  # what is held back is left as it is
         assert all(torch.equal(getattr(before, field), getattr(after, field)) for field in TENSORS)
+    learned, held = ({name for batch in batches for name in batch.names} for batches in drawn[True])
+    assert (learned, held) == tuple(map(set, vars(split_outfit(tiny_outfit, settings.split)).values()))
+    assert image.scan_points.shape == (2, 1000, 3)
+
+
+def test_fresh_networks_follow_the_seed(settings, tiny_outfit):
+    one, again, other = (
+        fresh_avatar(
+            replace(settings, train=replace(settings.train, seed=seed)),
+            settings_from_dict(ClosetConfig, SETTINGS),
+            tiny_outfit.template,
+            [tiny_outfit],
+        ).codes
+        for seed in (1, 1, 2)
+    )
+    assert torch.equal(one, again) and not torch.equal(one, other)
+
+
+def test_a_run_is_built_on_the_mean_body_of_its_outfits():
+    bodies = [open_body(shape).template for shape in ("female", "male")]
+    mean = mean_template(bodies)
+    for name in ("vertices", "joints"):
+        torch.testing.assert_close(getattr(mean, name), (getattr(bodies[0], name) + getattr(bodies[1], name)) / 2)
+
+
+def test_the_best_weights_are_those_of_the_best_checkpoint(tmp_path):
+    for step, score in ((1, 0.5), (2, 0.3), (3, 0.4)):
+        state = {"model": {"weight": torch.tensor(float(step))}, "step": step, "seconds": 10.0 * step}
+        save_checkpoint(tmp_path / "checkpoints", state, step, score)
+    last, facts = {"weight": torch.tensor(3.0)}, {"steps": 3, "seconds": 30.0}
+    assert choose_weights(tmp_path, "last", last, facts) == (last, 3, 30)
+    assert choose_weights(tmp_path, "best", last, facts) == ({"weight": torch.tensor(2.0)}, 2, 20)
 
 
 def test_point_counts_and_outfits_out_of_range_are_refused(settings, tiny_outfit):
@@ -135,6 +188,10 @@ def test_point_counts_and_outfits_out_of_range_are_refused(settings, tiny_outfit
         template_samples(tiny_outfit.template, 400_001)
     with pytest.raises(DataError, match=r"no such outfit.*Did you mean tiny"):
         train_run(replace(settings, outfit=("tinny",)))
+    avatar = TrainedAvatar(torch.nn.Identity(), tiny_outfit.template, replace(settings, outfit=("tee", "tiny")), 0, 0.0)
+    assert [outfit_index(avatar, name) for name in ("tee", "tiny")] == [0, 1]
+    with pytest.raises(AvatarError, match=r"trained on tee, tiny, not on 'skirt'"):
+        outfit_index(avatar, "skirt")
     with pytest.raises(AvatarError, match="different outfits"):
         replace(settings, outfit=("tiny", "tiny"))
     with pytest.raises(AvatarError, match="device: expected auto, cpu"):
