@@ -67,7 +67,8 @@ def test_frames_of_a_split_are_exported_by_sequence_at_the_times_of_their_number
     names = {f"{sequence}/{file}" for sequence in ("walk", "squat") for file in ("points.usdc", "preview.webp")}
     assert {str(path.relative_to(target)) for path in made} == names | {"body.glb"}
     assert times(target / "walk" / "points.usdc", "points") == (24, 9, 20, [9, 10, 19, 20])
-    points = Usd.Stage.Open(str(target / "walk" / "points.usdc")).GetPrimAtPath("/avatar/points").GetAttribute("points")
+    stage = Usd.Stage.Open(str(target / "walk" / "points.usdc"))
+    points = stage.GetPrimAtPath("/avatar/points").GetAttribute("points")
     assert [round(points.Get(t)[0][0] - float(cloud.points[0, 0])) for t in (9, 10, 19, 20)] == [0, 1, 1, 2]
     assert times(target / "squat" / "points.usdc", "points") == (24, 72, 72, [72])
 
