@@ -33,7 +33,7 @@ from avatar.environment import prepare_process  # isort: skip
 from avatar.arguments import explain, refuse_code, tidy_arguments
 from avatar.checks import AvatarError
 from avatar.cli import refuse, silence_closed_streams
-from avatar.invocation import PIPE_CLOSED, STOPPED
+from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
 from avatar.pipeline.endings import report_ending
 from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
 from avatar.progress import WORK
@@ -42,7 +42,7 @@ from avatar.training.distributed import current_team, torchrun_team
 from avatar.training.signals import Stopped, leave_when_asked
 from avatar.verbs import VERBS, resolve
 
-CONF = Path(__file__).parents[1] / "conf"
+CONF = (checkout() or PACKAGE) / "conf"  # a wheel has it in the package
 METHOD_SETTINGS = "avatar.pipeline.methods:SETTINGS"
 Settings = TypeVar("Settings")
 report = logging.getLogger(__name__)

@@ -209,21 +209,19 @@ def test_ctrl_c_saves_and_says_how_to_go_on_and_a_second_leaves_at_once(folder):
     assert code == 75 and err == "train: stopped by SIGINT before it began.\n"
 
 
-def sleep_on(folder: Path, name: str) -> None:
-    """A job that says that it began, and never ends."""
-    (folder / name).touch()
+WORKERS = """
+import sys, time
+from pathlib import Path
+from avatar.processes import in_workers
+from avatar.training.signals import leave_when_asked
+
+def sleep_on(name):
+    Path(name).touch()
     time.sleep(1000)
 
-
-WORKERS = """
-import sys
-sys.path[:0] = [{tests!r}, {root!r}]
-from pathlib import Path
-from test_command_line import in_workers, sleep_on
-from avatar.training.signals import leave_when_asked
 if __name__ == "__main__":
     with leave_when_asked():
-        list(in_workers(sleep_on, [(Path({folder!r}), name) for name in "abcd"], 2))
+        list(in_workers(sleep_on, [(name,) for name in "abcd"], 2))
 """
 
 
@@ -231,16 +229,17 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_workers_end_quietly_with_who_started_them(tmp_path, number):
     """Ctrl-C goes to the whole group, SIGTERM to the command alone, and SIGKILL leaves it no time for anything."""
-    script = tmp_path / "script.py"
-    script.write_text(WORKERS.format(tests=str(ROOT / "tests"), root=str(ROOT), folder=str(tmp_path)))
-    process = subprocess.Popen([sys.executable, script], stderr=subprocess.PIPE, text=True, start_new_session=True)
-    deadline = time.monotonic() + 200
-    while not (tmp_path / "b").exists() and time.monotonic() < deadline:
+    (tmp_path / "script.py").write_text(WORKERS)
+    options = {"cwd": tmp_path, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    process = subprocess.Popen([sys.executable, "script.py"], env=os.environ | {"PYTHONPATH": str(ROOT)}, **options)
+    deadline = time.monotonic() + 60
+    while not ((tmp_path / "a").exists() and (tmp_path / "b").exists()):
+        assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.05)
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
     code, _, err = finish(process)  # at the end of standard error, which the workers hold as well
     assert code == (75 if number != signal.SIGKILL else -signal.SIGKILL)
-    assert err == "" and not (tmp_path / "c").exists()
+    assert (err == "" or number == signal.SIGKILL) and not (tmp_path / "c").exists()  # Python counts what was leaked
 
 
 @pytest.mark.slow
