@@ -7,10 +7,11 @@ autograd runs their backward passes in a thread of the device. What an operation
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import return_and_correct_aliasing
-from torch.utils._pytree import tree_flatten, tree_map
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 NAME = "pretended"
@@ -78,49 +79,70 @@ class PretendedTensor(torch.Tensor):
     @classmethod
     def __torch_dispatch__(cls, operation, types, args=(), kwargs=None):
         kwargs = kwargs or {}
-        used.add(plain_name(operation, args))
+        name = operation._schema.name.removeprefix("aten::").strip("_").removesuffix("_impl")
+        used.add(f"{name}, accumulating" if name == "index_put" and len(args) > 3 and args[3] else name)
         check_devices(operation, args, kwargs)
-        if torch.Tag.inplace_view in operation.tags:
-            raise NotImplementedError(f"{operation}: changes the shape of a tensor in place.")
-        device = kwargs.get("device")
-        stays = device is None or torch.device(device).type == NAME
-        options = kwargs if device is None else kwargs | {"device": torch.device("cpu")}
-        found = operation(*tree_map(unwrap, args), **tree_map(unwrap, options))
-        if not stays:
+        device, options = kwargs.get("device"), kwargs
+        if device is not None:
+            options = kwargs | {"device": torch.device("cpu")}
+        found = operation(*unwrap(args), **{key: unwrap(value) for key, value in options.items()})
+        if device is not None and torch.device(device).type != NAME:
             return found
         if operation is aten.copy_.default:
             return args[0]
-        return return_and_correct_aliasing(operation, args, kwargs, tree_map(wrap, found))
+        return return_and_correct_aliasing(operation, args, kwargs, wrap(found)) if aliases(operation) else wrap(found)
 
 
-def plain_name(operation, args) -> str:
-    """An operation's name whatever it writes to, and whether it adds up what it puts."""
-    name = operation._schema.name.removeprefix("aten::").strip("_").removesuffix("_impl")
-    accumulates = name == "index_put" and len(args) > 3 and args[3]
-    return f"{name}, accumulating" if accumulates else name
+@cache
+def aliases(operation) -> bool:
+    """Whether an operation gives a view of an argument, or writes to one.
+
+    Raises:
+        NotImplementedError: for one that changes the shape of a tensor in place.
+    """
+    if torch.Tag.inplace_view in operation.tags:
+        raise NotImplementedError(f"{operation}: changes the shape of a tensor in place.")
+    schema = operation._schema
+    return any(part.alias_info is not None for part in (*schema.arguments, *schema.returns))
 
 
 def unwrap(value):
+    """A value, or a nest of them, with the tensors of the CPU in the place of the device's."""
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(unwrap, value))
     return value.inner if isinstance(value, PretendedTensor) else value
 
 
 def wrap(value):
+    """What an operation gave, as the device's."""
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(wrap, value))
     return PretendedTensor(value) if isinstance(value, Tensor) else value
+
+
+def leaves_of(value):
+    """The values in a nest of them."""
+    if isinstance(value, (list, tuple)):
+        for item in value:
+            yield from leaves_of(item)
+    else:
+        yield value
 
 
 def check_devices(operation, args, kwargs) -> None:
     """Refuses tensors of two devices and CPU generators, but where CUDA does not."""
-    leaves = tree_flatten((args, kwargs))[0]
-    for value in leaves:
+    if operation in INDEXING and isinstance(args[0], PretendedTensor):
+        args = (args[0], *args[2:])  # the indices may be the CPU's
+    strange = []
+    for value in leaves_of((*args, *kwargs.values())):
         if isinstance(value, torch.Generator) and value.device.type != NAME:
             raise RuntimeError(f"Expected a '{NAME}' device type for generator but found '{value.device.type}'")
-    if operation in CROSSING:
+        if isinstance(value, Tensor) and not isinstance(value, PretendedTensor):
+            strange.append(value)
+    if not strange or operation in CROSSING:
         return
-    if operation in INDEXING and isinstance(args[0], PretendedTensor):
-        leaves = tree_flatten((args[0], args[2:]))[0]  # the indices may be the CPU's
     scalars = torch.Tag.pointwise in operation.tags or operation in SCALARS or operation in INDEXING
-    strange = [v for v in leaves if isinstance(v, Tensor) and not isinstance(v, PretendedTensor)]
-    written = bool(strange) and operation._schema.is_mutable and strange[0] is leaves[0]
+    written = operation._schema.is_mutable and strange[0] is args[0]
     if written or any(value.dim() or not scalars for value in strange):
         raise RuntimeError(
             f"Expected all tensors to be on the same device, but found at least two devices, {NAME}:0 and cpu! "

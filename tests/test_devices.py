@@ -75,6 +75,7 @@ METHODS = {
     "scanimate_global": ("scanimate", implicit(pose="global")),
     "colored": ("scanimate", implicit(colored=True)),
 }
+RESUMED = ("closet", "closet_learned", "pop", "scanimate")  # stopped after a step: one for each kind of state
 FIELD = SkinningFieldConfig(width=16, layers=2, skip=1, orders=2)
 CYCLES = CycleConfig(
     first_steps=2,
@@ -168,15 +169,15 @@ def test_a_canonicalizer_made_and_resumed_on_the_device_is_the_cpus(runs):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_a_method_trained_resumed_and_predicted_on_the_device_is_the_cpus(runs, name):
-    """Training stops after a step and goes on; prediction loads what it left onto the device again."""
+def test_a_method_trained_and_predicted_on_the_device_is_the_cpus(runs, name):
+    """Prediction loads what training left onto the device again."""
     method, settings = METHODS[name]
     space = Space.canonical if name == "closet_canonical" else Space.posed
     clouds = []
     for kind, run in runs.items():
         run = replace(run, method=MethodChoice(method, name, settings), space=space)
         pretended.used.clear()
-        if kind == "auto":
+        if kind == "auto" and name in RESUMED:
             train(replace(run, train=replace(run.train, steps=1)))
         folder = train(run)
         (points,) = predict(PredictConfig(run=folder, points=1000, device=kind, surface=ExtractionConfig(16, 8)))
