@@ -73,8 +73,8 @@ def test_decoder_is_asked_with_features_place_and_zeros():
     row, column = divmod(int(grid.pixels[pixel]), 32)
     pose = model.pose_encoder(model.atlas.position_map(batch.pose_vertices))[:, :, row, column]
     garment = model.garment_encoder(model.codes)[batch.outfit_ids][:, :, row, column]
-    place = torch.tensor([(column + 0.5) / 32, (row + 0.5) / 32, 0, 0]).expand(3, -1)
-    decoded = model.pose_decoder(torch.cat([pose, garment, place], dim=1)[:, None])
+    place = torch.tensor([[(column + 0.5) / 32, (row + 0.5) / 32, 0, 0]])
+    decoded = model.pose_decoder(torch.cat([pose, garment], dim=1)[:, None], place)
     torch.testing.assert_close(model(batch, sample).offsets, decoded.offsets * 0.02, rtol=1e-4, atol=1e-6)
 
 

@@ -89,9 +89,8 @@ class PopAvatar(nn.Module):
         return self.atlas.pixel_points(points) if self.config.points is PointSource.grid else None
 
     def garment_features(self, codes: Tensor, uv: Tensor) -> Tensor:
-        """Garment features and place of each point: ``(O, C, S, S)`` codes to ``(O, N, C + 4)``."""
-        features = look_up(self.garment_encoder(codes), uv)
-        return torch.cat([features, uv_and_patch(uv, torch.zeros_like(uv), len(codes))], dim=-1)
+        """Garment features of each point: ``(O, C, S, S)`` codes to ``(O, N, C)``."""
+        return look_up(self.garment_encoder(codes), uv)
 
     def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
         """Predicts the dressed surface of each frame at template points.
@@ -110,14 +109,14 @@ class PopAvatar(nn.Module):
         outfits = batch.outfits
         row = torch.searchsorted(outfits, batch.outfit_ids)
         codes, uv = self.codes[outfits], self.atlas.place(samples)
-        garment = self.garment_features(codes, uv)
+        garment, places = self.garment_features(codes, uv), uv_and_patch(uv, torch.zeros_like(uv))
         parts = []
         if self.config.template:
-            decoded = self.garment_decoder(garment)
+            decoded = self.garment_decoder(garment, places)
             parts.append(Decoded(decoded.offsets[row], decoded.normals[row]))
         if wrinkles:
             pose = look_up(self.pose_encoder(self.atlas.position_map(batch.pose_vertices)), uv)
-            parts.append(self.pose_decoder(torch.cat([pose, garment[row]], dim=-1)))
+            parts.append(self.pose_decoder(torch.cat([pose, garment[row]], dim=-1), places))
         parts = [Decoded(part.offsets.float() * self.config.offset_scale, part.normals.float()) for part in parts]
         local = sum(parts[1:], parts[0])
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
@@ -144,6 +143,7 @@ class PopAvatar(nn.Module):
         if not self.config.template:
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")
         uv = self.atlas.place(samples)
-        decoded = self.garment_decoder(self.garment_features(self.codes[outfit : outfit + 1], uv))
+        features = self.garment_features(self.codes[outfit : outfit + 1], uv)
+        decoded = self.garment_decoder(features, uv_and_patch(uv, torch.zeros_like(uv)))
         points = interpolate(self.vertices, samples) + decoded.offsets * self.config.offset_scale
         return Decoded(points, normalize(decoded.normals, dim=-1))
