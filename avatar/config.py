@@ -24,9 +24,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-# First of all: it says how threads wait, which torch reads when it is imported.
-from avatar.environment import prepare_process  # isort: skip
 from avatar.checks import AvatarError, DataError
+from avatar.environment import prepared_process
 from avatar.io.documents import check_events, read_yaml
 from avatar.pipeline.benchmarks.bench import BenchConfig
 from avatar.pipeline.comparison import CompareConfig
@@ -169,6 +168,7 @@ def command(verb: str, run: Callable[[Any], Any], then: Callable[[list[Any]], An
     sys.exit(STOPPED if State.stopped in states else code or (2 if states else 0))
 
 
+@prepared_process()
 def run_job(
     verb: str,
     run: Callable[[Any], Any],
@@ -182,7 +182,6 @@ def run_job(
     In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. ``then`` follows a job
     that is the only one.
     """
-    prepare_process()
     logging.basicConfig(level=logging.INFO, format="%(message)s")  # what verbs report; conf/hydra keeps Hydra quiet
     job = HydraConfig.get()
     several = job.mode is RunMode.MULTIRUN

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
+from avatar.environment import prepared_process
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.io.npz import write_whole
 from avatar.pipeline.canonicalization import canonicalize
@@ -30,6 +31,7 @@ class DemoConfig(RunConfig):
     score: ScoreConfig = field(default_factory=ScoreConfig)
 
 
+@prepared_process()
 def demo(config: DemoConfig) -> Path:
     """Runs the main job; gives ``<runs>/demo/summary.json``, which says what was made and how long each stage took."""
     seconds: dict[str, float] = {}

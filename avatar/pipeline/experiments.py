@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
+from avatar.environment import prepared_process
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.npz import write_whole
@@ -48,6 +49,7 @@ class ExperimentConfig(RunConfig):
         return RunConfig(**values | {"name": f"{self.name}_{budget}_{share}_seed{train.seed}"})
 
 
+@prepared_process()
 def experiment(config: ExperimentConfig) -> Path:
     """Canonicalizes where the method needs it, trains, predicts and scores; what is finished is not done again.
 

@@ -13,6 +13,7 @@ from avatar.data.layouts import find_outfit
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
+from avatar.environment import prepared_process
 from avatar.evaluation.floors import score_body_floor, score_sampling_floor
 from avatar.evaluation.scores import Scores, read_scores, write_scores
 from avatar.evaluation.scoring import Label, ScoreConfig, score_predictions
@@ -84,6 +85,7 @@ def scores_file(folder: Path, split: str) -> Path:
     return folder / ("scores.csv" if split == "test" else f"scores.{split}.csv")
 
 
+@prepared_process()
 def predict(config: PredictConfig) -> list[Path]:
     """Predicts every outfit of a run; gives the folders of point clouds.
 
@@ -115,6 +117,7 @@ def predict(config: PredictConfig) -> list[Path]:
     return folders
 
 
+@prepared_process()
 def evaluate(config: EvaluateConfig) -> Scores:
     """Scores runs, or a foreign program's predictions, beside their floors; prints the tables.
 
