@@ -28,11 +28,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-# First of all: it says how threads wait, which torch reads when it is imported.
-from avatar.environment import prepare_process  # isort: skip
 from avatar.arguments import explain, refuse_code, tidy_arguments
 from avatar.checks import AvatarError
 from avatar.cli import refuse, silence_closed_streams
+from avatar.environment import prepared_process
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
 from avatar.pipeline.endings import report_ending
 from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
@@ -133,13 +132,13 @@ def conclude(verb: str, outcomes: list[Outcome]) -> int:
     return code
 
 
+@prepared_process()
 def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: Path, parent: int) -> None:
     """One job of a verb, in the ``parent`` process or in one that a launcher started.
 
     In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. The verb's ``then``
     follows a job that is the only one.
     """
-    prepare_process()
     listen_to_verbs(logging.INFO)
     job = HydraConfig.get()
     several = job.mode is RunMode.MULTIRUN

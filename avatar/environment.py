@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import ctypes
 import importlib.metadata
+import logging
 import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
+import avatar
 from avatar.checks import AvatarError
 from avatar.invocation import CORE, DISTRIBUTIONS, install_line
 
 if TYPE_CHECKING:
     import torch
 
-# Idle OpenMP threads look for work for some microseconds and then sleep. Where processes share cores, threads that spin
-# without end make a training step many times slower; threads that sleep at once have to be woken for each of its many
-# small pieces of work, a fifth of its time. OpenMP reads both when torch is first imported, so they stand here, in what
-# `avatar.config` imports first.
-if "OMP_WAIT_POLICY" not in os.environ:
-    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+FIRST_PROCESS = os.getpid()  # that this module was imported in; any other is a fork of it
+report = logging.getLogger(__name__)
+
 
 APT_PACKAGES = {
     "libusb-1.0": "libusb-1.0-0",
@@ -127,16 +128,56 @@ def accelerator() -> str:
     return f"CPU with {torch.get_num_threads()} threads"
 
 
-def prepare_process() -> None:
-    """What every verb does first, for speed: keeps freed memory, and takes numbers below 1e-38 for zero.
+@contextmanager
+def prepared_process() -> Iterator[None]:
+    """Prepares the process for work on the CPU, as a ``with`` block or as the decorator of every function that does it.
 
-    Processors are slow with such numbers, and the steep softplus of a signed distance is full of them
-    (docs/performance.md). Threads started later take this over.
+    Freed memory is kept from then on. Numbers below 1e-38 count as zero, in this thread and in the OpenMP threads that
+    work for it, for the length of the block: processors are slow with such numbers, and the steep softplus of a signed
+    distance is full of them (docs/performance.md). Afterwards all is as the caller had it, for it changes the caller's
+    arithmetic, too. Blocks may be nested. A job is prepared alike from the command line and from Python, so its bits
+    are the same; how idle threads wait is read when torch is imported, and a warning says when that was too early.
+    """
+    warn_once_of_early_torch()
+    keep_freed_memory()
+    before = flushes_denormals()
+    flush_denormals(True)
+    try:
+        yield
+    finally:
+        if not before:
+            flush_denormals(False)
+
+
+def flushes_denormals() -> bool:
+    """Whether this thread takes numbers too small for full precision for zero."""
+    smallest = sys.float_info.min
+    return smallest / 2 == 0
+
+
+def flush_denormals(on: bool) -> None:
+    """Has this thread, and the OpenMP threads that work for it, take such numbers for zero, or count them in full.
+
+    The processor has this switch in each thread, and a new thread takes over that of the one that starts it. So
+    OpenMP's idle threads are ended: the next ones are started from this thread when there is work. A forked process
+    has none of its parent's threads and must not wait for them.
     """
     import torch
 
-    keep_freed_memory()
-    torch.set_flush_denormal(True)
+    torch.set_flush_denormal(on)
+    end = getattr(ctypes.CDLL(torch._C.__file__), "omp_pause_resource_all", None) if sys.platform == "linux" else None
+    if end is not None and os.getpid() == FIRST_PROCESS:
+        end(1)  # omp_pause_soft
+
+
+@cache
+def warn_once_of_early_torch() -> None:
+    """Says that torch was imported before this package, which could then not choose how its idle threads wait."""
+    if avatar.TOO_LATE:
+        report.warning(
+            "torch was imported before avatar, so its idle threads spin, which is slow where processes share cores. "
+            "Hint: import avatar first, or start Python with OMP_WAIT_POLICY=PASSIVE GOMP_SPINCOUNT=10000."
+        )
 
 
 def keep_freed_memory() -> bool:

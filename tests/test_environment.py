@@ -1,5 +1,9 @@
 """The doctor: what is there, what is missing, and the line that mends it."""
 
+import ast
+import importlib
+import inspect
+import json
 import os
 import platform
 import subprocess
@@ -10,6 +14,14 @@ import pytest
 
 from avatar.environment import inspect_package, mending_line
 from avatar.invocation import interpreter
+from avatar.pipeline.torture.miniature import folder_of, prepare, run_config, weights_digest
+from avatar.settings import settings_to_dict
+from avatar.training.canonicalizing import canonicalize_frames, train_canonicalizer
+from avatar.training.fitting import fit_outfit
+from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
+from avatar.training.implicit_runs import train_implicit
+from avatar.training.prediction import predict_frames, predict_motion
+from avatar.training.runs import RunConfig, flatten, train_run
 
 ROOT = Path(__file__).parents[1]
 
@@ -38,12 +50,17 @@ def test_a_missing_library_is_mended_by_its_package(message, line):
     assert mending_line("open3d", message).startswith(line)
 
 
-def in_fresh_python(code: str, **variables: str) -> subprocess.CompletedProcess:
+def in_fresh_python(code: str, *arguments: str, **variables: str) -> subprocess.CompletedProcess:
     """A new interpreter's output, without what this one says about threads."""
     told = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
     kept = {name: value for name, value in os.environ.items() if name not in told}
     return subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, env=kept | variables
+        [sys.executable, "-c", code, *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        env=kept | variables,
     )
 
 
@@ -72,17 +89,109 @@ def test_every_verb_keeps_freed_memory_for_what_comes_next():
     assert thrown_away > 3 * 10_000 and kept < 1000
 
 
+X86 = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the switch of x86 processors")
+LEFT = (
+    "import torch\n"
+    "def left():\n"
+    "    tiny = torch.full((1 << 20,), 1e-20)\n"
+    "    return int((tiny * tiny).count_nonzero())\n"
+)
+
+
+@X86
 def test_every_verb_takes_the_smallest_numbers_for_zero_in_all_threads():
-    code = (
-        "import torch\n"
+    """Also in OpenMP threads that were at work before; and numbers are the caller's own again afterwards."""
+    code = LEFT + (
         "from avatar.config import command\n"
-        "def left(config):\n"
-        "    tiny = torch.tensor([1e-20]).repeat(1 << 20)\n"
-        "    print(int((tiny * tiny).count_nonzero()))\n"
-        "command('bench', left)"
+        "print(left())\n"
+        "try: command('bench', lambda config: print(left()))\n"
+        "except SystemExit: print(left())"
     )
-    if platform.machine() in ("x86_64", "AMD64"):
-        assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.strip() == "0"
+    assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.split() == [str(1 << 20), "0", str(1 << 20)]
+
+
+@X86
+def test_blocks_of_a_prepared_process_may_be_nested_and_left_by_errors():
+    code = LEFT + (
+        "from avatar.environment import prepared_process\n"
+        "@prepared_process()\n"
+        "def work(depth):\n"
+        "    if depth == 2: raise KeyError\n"
+        "    try: work(depth + 1)\n"
+        "    finally: print(left())\n"
+        "try: work(0)\n"
+        "except KeyError: print(left())"
+    )
+    assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.split() == ["0", "0", str(1 << 20)]
+
+
+@X86
+def test_a_fork_does_not_wait_for_its_parents_threads():
+    code = LEFT + (
+        "import os\n"
+        "from avatar.environment import prepared_process\n"
+        "left()\n"
+        "torch.set_num_threads(1)\n"
+        "child = os.fork()\n"
+        "with prepared_process(): found = left()\n"
+        "if child == 0: os._exit(found and 3)\n"
+        "print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))"
+    )
+    assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.strip() == "0"
+
+
+@pytest.mark.parametrize("first", ["torch", "avatar"])
+def test_who_imports_torch_too_early_is_warned_once(first):
+    code = f"import {first}, torch\nfrom avatar.environment import prepared_process\n"
+    code += "for _ in range(2):\n    with prepared_process(): pass"
+    said = in_fresh_python(code).stderr
+    assert said.count("Hint: import avatar first") == (first == "torch")
+    assert "Hint" not in in_fresh_python(code, OMP_WAIT_POLICY="ACTIVE").stderr
+
+
+def test_all_that_verbs_and_callers_of_the_package_start_prepares_the_process():
+    """Every function that a tool gives to `command`, and those that the docs call from Python."""
+    started = [train_run, train_implicit, train_canonicalizer, canonicalize_frames, fit_outfit]
+    started += [predict_frames, predict_motion, predict_implicit_frames, predict_implicit_motion]
+    for tool in sorted((ROOT / "tools").glob("*.py")):
+        tree = ast.parse(tool.read_text())
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        names = [call.args[1].id for call in calls if getattr(call.func, "id", "") == "command"]
+        homes = {
+            alias.name: node.module for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names
+        }
+        started += [getattr(importlib.import_module(homes[name]), name) for name in names]
+    assert len(started) > 20
+    bare = [f.__qualname__ for f in started if not inspect.getsource(f).startswith("@prepared_process()")]
+    assert bare == []
+
+
+@pytest.mark.slow
+def test_a_run_from_python_has_the_bits_of_the_command_s(tmp_path):
+    """Training whose numbers fall below 1e-38, in two threads, after other work with torch."""
+    prepare(tmp_path)
+    config = run_config("scanimate", tmp_path, steps=6)
+    wanted, defaults = flatten(settings_to_dict(config)), flatten(settings_to_dict(RunConfig()))
+    line = [f"{name}={json.dumps(value, default=str)}" for name, value in wanted.items()]
+    line = [word for word in line if not word.startswith("method.settings") and word.split("=")[0] in defaults]
+    line += [f"method.settings.{name}={json.dumps(value)}" for name, value in flatten(config.method.settings).items()]
+    words = [word for word in line if not word.startswith("method.name") and not word.endswith("=null")]
+    options = {"OMP_NUM_THREADS": "2"}
+    command = [sys.executable, str(ROOT / "tools" / "train.py"), "method=scanimate", *words, "name=command"]
+    done = subprocess.run(command, cwd=tmp_path, env=os.environ | options, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    code = (
+        "import sys, torch\n"
+        "torch.ones(1 << 20).exp().sum()  # two OpenMP threads are there before the package is\n"
+        "from pathlib import Path\n"
+        "from avatar.pipeline.torture.miniature import run_config\n"
+        "from avatar.training.implicit_runs import train_implicit\n"
+        "train_implicit(run_config('scanimate', Path(sys.argv[1]), 'python', steps=6))"
+    )
+    in_fresh_python(code, str(tmp_path), **options)
+    assert weights_digest(folder_of("scanimate", tmp_path, "command")) == weights_digest(
+        folder_of("scanimate", tmp_path, "python")
+    )
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_finite, check_shape
+from avatar.geometry.precision import full_precision
 
 BOX_MARGIN = 0.1  # of the box's longest side, added on every side: room for clothes around the body
 
@@ -56,6 +57,7 @@ class SkinningField(nn.Module):
             incoming = config.width
         self.head = nn.Linear(incoming, joints)
 
+    @full_precision
     def forward(self, points: Tensor, latent: Tensor | None = None, box: Tensor | None = None) -> Tensor:
         """Weights ``(B, N, J)`` of points ``(B, N, 3)``.
 

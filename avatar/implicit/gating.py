@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from avatar.body.skinning import tree_distances
 from avatar.checks import AvatarError, check_shape
+from avatar.geometry.precision import full_precision
 from avatar.geometry.transforms import relative_quaternions
 
 
@@ -64,6 +65,7 @@ class PoseGate(nn.Module):
         self.channels = 4 * (len(parents) - 1)
         self.register_buffer("attention", attention_map(parents, rings, attention, normalised)[1:], persistent=False)
 
+    @full_precision
     def forward(self, weights: Tensor, joint_transforms: Tensor) -> Tensor:
         """``(B, N, J)`` skinning weights and ``(B, J, 4, 4)`` posed_from_canonical to ``(B, N, 4 (J - 1))``."""
         dims = check_shape("weights", weights, "B N J", J=len(self.parents))

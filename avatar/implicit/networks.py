@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
 from avatar.checks import AvatarError
+from avatar.geometry.precision import full_precision
 
 
 @dataclass
@@ -32,7 +33,10 @@ class MlpConfig:
 
 
 class SkipMlp(nn.Module):
-    """Softplus layers with weight norm; one of them gets the input again, scaled so that its variance stays."""
+    """Softplus layers with weight norm; one of them gets the input again, scaled so that its variance stays.
+
+    Always in full precision: what goes in are positions, what comes out is a distance to half a millimetre.
+    """
 
     def __init__(self, inputs: int, outputs: int, config: MlpConfig):
         """Builds the network: ``inputs`` channels to ``outputs`` channels."""
@@ -46,6 +50,7 @@ class SkipMlp(nn.Module):
         self.head = weight_norm(nn.Linear(incoming, outputs))
         self.channels = incoming
 
+    @full_precision
     def features(self, inputs: Tensor) -> Tensor:
         """What the last hidden layer makes of ``(..., inputs)``: ``(..., channels)``."""
         hidden = inputs
@@ -55,6 +60,7 @@ class SkipMlp(nn.Module):
             hidden = self.softplus(layer(hidden))
         return hidden
 
+    @full_precision
     def forward(self, inputs: Tensor) -> Tensor:
         """``(..., inputs)`` to ``(..., outputs)``."""
         return self.head(self.features(inputs))

@@ -125,10 +125,8 @@ class ClosetAvatar(nn.Module):
         self.skinning = skinning
 
     def surface_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
-        """Garment features and template position of each sample: ``(O, V, C)`` codes to ``(O, N, C' + 3)``."""
-        features = interpolate(self.garment_encoder(codes), samples)
-        positions = interpolate(self.vertices, samples).expand(len(codes), -1, -1)
-        return torch.cat([features, positions.to(features.dtype)], dim=-1)
+        """Garment features of each sample: ``(O, V, C)`` codes to ``(O, N, C')``."""
+        return interpolate(self.garment_encoder(codes), samples)
 
     def pose_features(self, batch: Batch, samples: SurfaceSamples) -> Tensor:
         """What each sample knows of its frame's pose, ``(B, N, C)``."""
@@ -157,14 +155,14 @@ class ClosetAvatar(nn.Module):
         outfits = batch.outfits
         row = torch.searchsorted(outfits, batch.outfit_ids)
         codes = pick(self.codes, outfits)
-        garment = self.surface_features(codes, samples)
+        garment, places = self.surface_features(codes, samples), interpolate(self.vertices, samples)
         parts = []
         if self.config.template:
-            decoded = self.garment_decoder(garment)
+            decoded = self.garment_decoder(garment, places)
             parts.append(Decoded(pick(decoded.offsets, row), pick(decoded.normals, row)))
         if self.config.pose and wrinkles:
             pose = self.pose_features(batch, samples)
-            parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1)))
+            parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1), places))
         local = sum(parts, bare_body(self.skin_normals, samples, self.config.normals))
 
         scale = self.config.offset_scale
@@ -211,7 +209,8 @@ class ClosetAvatar(nn.Module):
         """
         if not self.config.template:
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")
-        decoded = self.garment_decoder(self.surface_features(self.codes[outfit : outfit + 1], samples))
-        dressed = bare_body(self.skin_normals, samples, self.config.normals) + decoded
-        points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
+        garment = self.surface_features(self.codes[outfit : outfit + 1], samples)
+        places = interpolate(self.vertices, samples)
+        dressed = bare_body(self.skin_normals, samples, self.config.normals) + self.garment_decoder(garment, places)
+        points = places + dressed.offsets * self.config.offset_scale
         return Decoded(points, normalize(dressed.normals, dim=-1))

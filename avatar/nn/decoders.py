@@ -8,10 +8,12 @@ from enum import Enum
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate
 from avatar.nn.pointnet2 import PointNorm
+from avatar.nn.wide import WideLinear, wide_linear
 from avatar.records import SurfaceSamples
 
 
@@ -71,15 +73,33 @@ class ShapeDecoder(nn.Module):
     """The decoder POP, SCALE and CloSET share: a trunk, the input joined again, then an offset and a normal branch."""
 
     def __init__(self, channels: int, config: DecoderConfig):
+        """Builds the decoder for ``channels`` features and coordinates of a place together."""
         super().__init__()
         width = config.width
         self.trunk = softplus_mlp((channels,) + (width,) * config.trunk)
         self.join = softplus_mlp((channels + width, width))
         hidden = (width,) * (config.branch + 1)
-        self.offset_branch = nn.Sequential(*softplus_mlp(hidden), nn.Linear(width, 3))
-        self.normal_branch = nn.Sequential(*softplus_mlp(hidden), nn.Linear(width, 3))
+        self.offset_branch = nn.Sequential(*softplus_mlp(hidden), WideLinear(width, 3))
+        self.normal_branch = nn.Sequential(*softplus_mlp(hidden), WideLinear(width, 3))
 
-    def forward(self, features: Tensor) -> Decoded:
-        """``(B, N, C)`` point features to offsets and normals ``(B, N, 3)``."""
-        joined = self.join(torch.cat([features, self.trunk(features)], dim=-1))
+    def forward(self, features: Tensor, places: Tensor) -> Decoded:
+        """``(B, N, C)`` features and ``(N, P)`` places of points to offsets and normals ``(B, N, 3)``.
+
+        Under autocast places, offsets and normals are float32 all the same.
+        """
+        hidden = lift(self.trunk, features, places)
+        joined = lift(self.join, features, places, hidden)
         return Decoded(self.offset_branch(joined), self.normal_branch(joined))
+
+
+def lift(layers: nn.Sequential, features: Tensor, places: Tensor, *others: Tensor) -> Tensor:
+    """Layers on the joined channels of features, places and others, the places in float32: ``(B, N, C)``."""
+    first, *rest = layers
+    parts = (features, places, *others)
+    mixing, placing, *adding = first.weight.split([part.shape[-1] for part in parts], dim=1)
+    lifted = linear(features, mixing) + wide_linear(places, placing, first.bias)
+    for other, weight in zip(others, adding):
+        lifted = lifted + linear(other, weight)
+    for layer in rest:
+        lifted = layer(lifted)
+    return lifted

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from avatar.body.skinning import tree_distances
 from avatar.checks import AvatarError
+from avatar.geometry.precision import full_precision
 from avatar.geometry.surface import interpolate
 from avatar.geometry.transforms import relative_quaternions
 from avatar.nn.pointnet2 import PointNorm, point_mlp
@@ -73,12 +74,16 @@ class LocalPoseEncoder(nn.Module):
 
     def forward(self, joint_transforms: Tensor, samples: SurfaceSamples) -> Tensor:
         """``(B, J, 4, 4)`` posed_from_canonical to features ``(B, N, C)`` of N points on the template."""
+        return self.rest(self.first(self.lift(joint_transforms, samples)))
+
+    @full_precision
+    def lift(self, joint_transforms: Tensor, samples: SurfaceSamples) -> Tensor:
+        """The first layer, before its normalisation: ``(B, N, C)``, in float32 for the sake of the positions."""
         rotations = relative_rotations(joint_transforms, self.parents)
         columns = self.pose_layer.weight.unflatten(1, rotations.shape[1:])
         joints = torch.einsum("bjq,cjq->bjc", rotations, columns)
         places = self.position_layer(fourier_features(interpolate(self.vertices, samples), self.orders))
-        lifted = interpolate(self.gates, samples) @ joints + places + self.pose_layer.bias
-        return self.rest(self.first(lifted))
+        return interpolate(self.gates, samples) @ joints + places + self.pose_layer.bias
 
 
 def fourier_features(points: Tensor, orders: int) -> Tensor:

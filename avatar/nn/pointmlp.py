@@ -8,8 +8,10 @@ from torch.nn.functional import relu
 
 from avatar.geometry.bags import Bags
 from avatar.geometry.neighbours import k_nearest
+from avatar.geometry.precision import widen
 from avatar.nn.hierarchy import FixedBags, Level, build_levels
 from avatar.nn.pointnet2 import PointNet2Config, PointNorm, SurfaceEncoder
+from avatar.nn.wide import WideLinear
 from avatar.records import Template
 
 
@@ -49,7 +51,7 @@ class PointMLPLevel(nn.Module):
     """One stage: affine neighbourhoods, residual blocks, maximum over the neighbours, residual blocks (eq. 4).
 
     The neighbours' differences alone would not tell what is at the centre, so its own feature is joined to them; the
-    layer that takes both is linear, and applied to a centre once.
+    layer that takes both is linear, and applied to a centre once. Differences are taken, and centres seen, in float32.
     """
 
     def __init__(self, level: Level, channels: int, widths: tuple[int, ...]):
@@ -61,15 +63,15 @@ class PointMLPLevel(nn.Module):
         self.own = FixedBags(Bags.of_table(own[:, None], len(level.finer_positions)))  # each centre in the finer level
         self.affine = GeometricAffine(channels + 3)
         self.difference_layer = nn.Linear(channels + 3, width, bias=False)
-        self.centre_layer = nn.Linear(channels + 3, width)
+        self.centre_layer = WideLinear(channels + 3, width)
         self.norm = PointNorm(width)
         self.before = nn.Sequential(*(ResidualPointMLP(width, narrow) for narrow in inner))
         self.after = nn.Sequential(*(ResidualPointMLP(width, narrow) for narrow in inner))
 
     def forward(self, features: Tensor) -> Tensor:
         """``(B, N, C)`` features of the finer level to ``(B, S, C')`` of the coarser."""
-        positions = self.level.finer_positions.to(features.dtype).expand(len(features), -1, -1)
-        joined = torch.cat([features, positions], dim=-1)
+        positions = self.level.finer_positions.expand(len(features), -1, -1)
+        joined = torch.cat([widen(features), positions], dim=-1)
         centres = self.own(joined)
         grouped = self.difference_layer(self.affine(self.level.group(joined), centres))
         lifted = relu(self.norm(grouped + self.centre_layer(centres).unsqueeze(2)))

@@ -11,6 +11,7 @@ from torch.nn.functional import linear
 
 from avatar.checks import AvatarError, check_shape
 from avatar.nn.hierarchy import HierarchyConfig, Level, build_levels
+from avatar.nn.wide import WideLinear, wide_linear
 from avatar.records import Template
 
 
@@ -54,11 +55,14 @@ class PointNorm(nn.BatchNorm1d):
         return super().forward(features.flatten(0, -2)).view_as(features)
 
 
-def point_mlp(widths: tuple[int, ...]) -> nn.Sequential:
-    """Linear, normalisation, ReLU for each consecutive pair of widths; acts on the last dimension."""
-    layers = []
+def point_mlp(widths: tuple[int, ...], first: type[nn.Linear] = nn.Linear) -> nn.Sequential:
+    """Linear, normalisation, ReLU for each consecutive pair of widths; acts on the last dimension.
+
+    ``first`` is the kind of the first layer: `WideLinear` where it sees positions.
+    """
+    layers: list[nn.Module] = []
     for fan_in, fan_out in itertools.pairwise(widths):
-        layers += [nn.Linear(fan_in, fan_out), PointNorm(fan_out), nn.ReLU()]
+        layers += [nn.Linear(fan_in, fan_out) if layers else first(fan_in, fan_out), PointNorm(fan_out), nn.ReLU()]
     return nn.Sequential(*layers)
 
 
@@ -66,14 +70,15 @@ class SetAbstraction(nn.Module):
     """Groups each coarse point's neighbours, maps them through a shared network and takes the maximum.
 
     The first layer sees [neighbour feature, relative position] and is linear, so it is applied once a point before
-    gathering, not once a neighbour: W_f f_j + W_p (x_j - x_i) = (W_f f_j + W_p x_j) - W_p x_i, exactly.
+    gathering, not once a neighbour: W_f f_j + W_p (x_j - x_i) = (W_f f_j + W_p x_j) - W_p x_i, exactly. In bfloat16
+    the difference would be 7% rounding, so this layer and its normalisation are always float32.
     """
 
     def __init__(self, level: Level, channels: int, widths: tuple[int, ...]):
         super().__init__()
         self.level = level
-        self.feature_layer = nn.Linear(channels, widths[0])
-        self.position_layer = nn.Linear(3, widths[0], bias=False)
+        self.feature_layer = WideLinear(channels, widths[0])
+        self.position_layer = WideLinear(3, widths[0], bias=False)
         self.first = nn.Sequential(PointNorm(widths[0]), nn.ReLU())
         self.rest = point_mlp(widths)
 
@@ -89,7 +94,8 @@ class FeaturePropagation(nn.Module):
     """Interpolates coarse features to the finer level, joins the finer level's own and maps both.
 
     The first layer sees [interpolated, own] and is linear, as interpolation is, so its first half comes before it,
-    where there are fewer points: W_c (sum_k w_k c_k) = sum_k w_k (W_c c_k), exactly.
+    where there are fewer points: W_c (sum_k w_k c_k) = sum_k w_k (W_c c_k), exactly. The finest level's own features
+    may be positions, so their half is always float32.
     """
 
     def __init__(self, level: Level, coarse_channels: int, fine_channels: int, widths: tuple[int, ...]):
@@ -101,7 +107,7 @@ class FeaturePropagation(nn.Module):
         """``(B, S, C)`` and ``(B, N, C')`` to ``(B, N, C'')``."""
         first, *rest = self.mlp
         mixing, adding = first.weight.split([coarse.shape[-1], fine.shape[-1]], dim=1)
-        lifted = self.level.spread(linear(coarse, mixing)) + linear(fine, adding, first.bias)
+        lifted = self.level.spread(linear(coarse, mixing)) + wide_linear(fine, adding, first.bias)
         for layer in rest:
             lifted = layer(lifted)
         return lifted

@@ -8,6 +8,7 @@ from torch.nn.functional import relu
 from avatar.geometry.neighbours import ball_query
 from avatar.nn.hierarchy import Grouping, build_levels
 from avatar.nn.pointnet2 import PointNet2Config, PointNorm, SetAbstraction, SurfaceEncoder, point_mlp
+from avatar.nn.wide import WideLinear
 from avatar.records import Template
 
 
@@ -53,7 +54,7 @@ class PointNeXt(SurfaceEncoder):
         sizes = config.hierarchy
         levels = build_levels(template.vertices, sizes)
         first = config.abstraction[0][-1]
-        stem = point_mlp((channels, first))
+        stem = point_mlp((channels, first), WideLinear)
         stages, incoming = [], first
         for level, radius, (*inner, width) in zip(levels, sizes.radii, config.abstraction):
             down = Neighbourhoods(level.positions, level.finer_positions, level.groups, radius)

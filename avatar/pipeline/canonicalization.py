@@ -14,6 +14,7 @@ from avatar.canonical.rivals import SkinningSource
 from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset
+from avatar.environment import prepared_process
 from avatar.evaluation.canonical_scores import canonical_table, score_canonicalization
 from avatar.evaluation.canonical_truth import Canonicalized, check_truth
 from avatar.evaluation.scores import Scores, write_scores
@@ -43,6 +44,7 @@ COLUMNS = ("scan", "weights", "canonical, front", "canonical, back", "weights, f
 PICTURE = (480, 480)
 
 
+@prepared_process()
 def canonicalize(config: CanonicalizeConfig) -> Path:
     """Trains or resumes a run's canonicalizer, writes every frame's canonical scan, draws some; gives the folder.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import yaml
 
 from avatar.checks import AvatarError, DataError, check_name
+from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, method_key
 from avatar.evaluation.canonical_scores import canonical_overview, canonical_table
 from avatar.evaluation.curves import plot_fractions, plot_progress, plot_times
@@ -59,6 +60,7 @@ class CompareConfig:
         find_metrics(self.metrics)
 
 
+@prepared_process()
 def compare(config: CompareConfig) -> Path:
     """Writes ``<out>/<table>.*``, which it prints; gives the path of the Markdown.
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from avatar.checks import AvatarError
+from avatar.environment import prepared_process
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.export.drawing import load_pyvista
 from avatar.export.meshing import require_poisson
@@ -46,6 +47,7 @@ class DemoConfig(RunConfig):
             )
 
 
+@prepared_process()
 def demo(config: DemoConfig) -> Path:
     """Runs the main job; gives ``<runs>/demo/summary.json``, which says what was made and how long each stage took.
 

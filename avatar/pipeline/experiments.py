@@ -9,6 +9,7 @@ from pathlib import Path
 
 from avatar.checks import AvatarError
 from avatar.data.outfits import SPLITS, VALIDATION
+from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.export.drawing import load_pyvista
@@ -60,6 +61,7 @@ class ExperimentConfig(RunConfig):
         return RunConfig(**values | {"name": f"{self.name}_{budget}_{share}_seed{train.seed}"})
 
 
+@prepared_process()
 def experiment(config: ExperimentConfig) -> Path:
     """Canonicalizes where the method needs it, trains, predicts and scores; what is finished is not done again.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from avatar.checks import unknown_name
+from avatar.environment import prepared_process
 from avatar.implicit.avatar import ImplicitAvatar
 from avatar.io.documents import read_yaml
 from avatar.nn.methods import METHODS
@@ -25,6 +26,7 @@ def find_settings(name: str) -> type:
     return SETTINGS[name]
 
 
+@prepared_process()
 def train(config: RunConfig) -> Path:
     """Trains a run by its method, or goes on with it; gives the run's folder."""
     find_settings(config.method.name)

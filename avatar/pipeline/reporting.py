@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.data.outfits import Outfit
+from avatar.environment import prepared_process
 from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent, write_report
 from avatar.evaluation.scores import Scores
 from avatar.evaluation.tables import View, metric_table, outfit_table
@@ -44,6 +45,7 @@ class ReportConfig:
     data_root: Path | None = None  # where the data are now; where they were at training if null
 
 
+@prepared_process()
 def report(config: ReportConfig) -> Path:
     """Writes ``<run>/report.html`` and, as one picture, ``<run>/pictures.png``.
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
+from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.floors import score_body_floor, score_sampling_floor
 from avatar.evaluation.scores import Score, Scores, frames_path, read_scores, write_scores
@@ -97,6 +98,7 @@ def scores_file(folder: Path, split: str) -> Path:
     return folder / ("scores.csv" if split == "test" else f"scores.{split}.csv")
 
 
+@prepared_process()
 def predict(config: PredictConfig) -> list[Path]:
     """Predicts every outfit of a run; gives the folders of point clouds.
 
@@ -135,6 +137,7 @@ def predicted_fps(folder: Path) -> float:
     return float(read_json(path)["fps"]) if path.is_file() else 30.0
 
 
+@prepared_process()
 def evaluate(config: EvaluateConfig) -> Scores:
     """Scores runs, or a foreign program's predictions, beside their floors; prints the tables.
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from avatar.checks import AvatarError, check_name
 from avatar.data.outfits import Outfit
+from avatar.environment import prepared_process
 from avatar.evaluation.scoring import Label
 from avatar.evaluation.seam_tables import SeamTest, check_baseline, name_of, seam_differences, seam_table, to_csv
 from avatar.evaluation.seams import SeamPlaces, measure_seams, seam_places
@@ -40,6 +41,7 @@ class SeamsConfig:
             raise AvatarError(f"points, frames: expected at least 1, got {self.points} and {self.frames}.")
 
 
+@prepared_process()
 def seams(config: SeamsConfig) -> Path:
     """Writes ``<out>/<table>.csv`` and ``<table>.md``, which it prints; gives the path of the latter.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avatar.checks import AvatarError, DataError, check_name
+from avatar.environment import prepared_process
 from avatar.export.animation import write_animation, write_usd_meshes, write_usd_points
 from avatar.export.meshing import MeshingReport, PoissonConfig, mesh_folder
 from avatar.export.pictures import frame_camera, render_points
@@ -47,6 +48,7 @@ class ExportConfig:
         check_name("predictions", self.predictions)
 
 
+@prepared_process()
 def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
     """Meshes the predictions of every outfit of a run into ``<run>/meshes/<split>/<outfit>``.
 
@@ -79,6 +81,7 @@ def spaced_frames(names: list[str], count: int | None) -> list[str]:
     return [names[round(i * (len(names) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
+@prepared_process()
 def export(config: ExportConfig) -> list[Path]:
     """Writes ``<run>/export/<motion>/<outfit>/{points.usdc, meshes.usdc, body.glb, preview.webp}``.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from avatar.body.open import open_body_shapes
 from avatar.checks import AvatarError, unknown_name
+from avatar.environment import prepared_process
 from avatar.io.motions import read_motion, resample_motion
 from avatar.records import Motion
 from avatar.simulate.dressing import TravelConfig
@@ -130,6 +131,7 @@ def settled_poses(config: SimulateConfig) -> dict[str, list[NamedPose]]:
     return poses
 
 
+@prepared_process()
 def simulate(config: SimulateConfig) -> list[FrameReport]:
     """Makes an open dataset, or measures its history error, as configured.
 

@@ -25,7 +25,7 @@ from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.soundness import check_frame_count
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.data.streaming import Streamed
-from avatar.environment import choose_device
+from avatar.environment import choose_device, prepared_process
 from avatar.geometry.chunks import in_chunks
 from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, file_digest, keyed, module_digest
@@ -142,6 +142,7 @@ class TrainedCanonicalizer:
         return torch.cat(parts).cpu().numpy()
 
 
+@prepared_process()
 def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None = None) -> Path:
     """Trains a run's canonicalizer, or goes on with it; gives the run's folder. Rivals have nothing to learn.
 
@@ -205,6 +206,7 @@ def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicaliz
     )
 
 
+@prepared_process()
 def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None = None) -> list[Path]:
     """Writes every frame's canonical scan to ``<run>/scans/<split>/<frame>.npz``; gives the files in order.
 

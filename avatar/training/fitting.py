@@ -11,6 +11,7 @@ from avatar.body.packed import write_template
 from avatar.checks import AvatarError, check_name
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
+from avatar.environment import prepared_process
 from avatar.nn.methods import draw_samples
 from avatar.progress import tracked
 from avatar.records import Batch
@@ -46,6 +47,7 @@ class FitConfig:
             raise AvatarError(f"steps, code_lr: expected positive values, got {self.steps} and {self.code_lr}.")
 
 
+@prepared_process()
 def fit_outfit(config: FitConfig) -> Path:
     """Fits the outfit and leaves a run folder like that of training, with the new outfit as its only one."""
     avatar = load_run(config.run, device=config.device)

@@ -10,6 +10,7 @@ import torch
 
 from avatar.checks import AvatarError, check_shape
 from avatar.data.outfits import Outfit
+from avatar.environment import prepared_process
 from avatar.implicit.avatar import sample_mesh
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.ledger import Ledger, keyed
@@ -46,6 +47,7 @@ def write_frame(
     return clouds / f"{name}.ply"
 
 
+@prepared_process()
 def predict_implicit_frames(
     avatar: TrainedAvatar,
     outfit: Outfit,
@@ -81,6 +83,7 @@ def predict_implicit_frames(
     return written
 
 
+@prepared_process()
 def predict_implicit_motion(
     avatar: TrainedAvatar,
     outfit: Outfit,

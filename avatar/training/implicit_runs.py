@@ -17,7 +17,7 @@ from avatar.data.mirroring import mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.data.streaming import Streamed
-from avatar.environment import choose_device
+from avatar.environment import choose_device, prepared_process
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig
 from avatar.implicit.body_field import BodyField
 from avatar.io.documents import read_yaml
@@ -30,6 +30,7 @@ from avatar.training.checkpoints import read_weights, write_weights
 from avatar.training.distributed import refuse_team
 from avatar.training.implicit_batches import CanonicalFrame, CanonicalFrames, canonical_frame
 from avatar.training.implicit_loop import ImplicitTrainConfig, ImplicitTrainer
+from avatar.training.loop import Precision
 from avatar.training.runs import WEIGHTS, RunConfig, TrainedAvatar, choose_weights, save_settings
 
 METHOD = "scanimate"  # its name in RunConfig.method
@@ -49,6 +50,7 @@ class ScanimateConfig:
     train: ImplicitTrainConfig = field(default_factory=ImplicitTrainConfig)
 
 
+@prepared_process()
 def train_implicit(config: RunConfig) -> Path:
     """Trains an implicit avatar on its canonicalizer's T-pose scans, or goes on with it; gives the run's folder.
 
@@ -57,6 +59,8 @@ def train_implicit(config: RunConfig) -> Path:
         DataError: when the canonicalizer or one of its scans is missing, naming the command that makes it.
     """
     refuse_team(METHOD)
+    if config.train.precision is not Precision.fp32:
+        raise AvatarError(f"train.precision: expected fp32 for {METHOD}, got {config.train.precision.value}.")
     settings = settings_from_dict(ScanimateConfig, config.method.settings, "method.settings.")
     config = replace(config, method=replace(config.method, settings=settings_to_dict(settings)))
     if len(config.outfit) != 1:

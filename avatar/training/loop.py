@@ -49,7 +49,7 @@ class Schedule(Enum):
 
 
 class Precision(Enum):
-    """Arithmetic of the network's forward pass; distances and losses are always float32."""
+    """Arithmetic of the network's forward pass; positions, distances and losses are always float32."""
 
     fp32 = "fp32"
     bf16 = "bf16"
@@ -107,7 +107,7 @@ class Trainer:
         if self.team.size > 1:
             share_norms(model)
         kept = model.state_dict().keys()
-        self.statistics = [b for name, b in model.named_buffers() if name in kept and b.is_floating_point()]
+        self.statistics = [buffer for name, buffer in model.named_buffers() if name in kept]
         codes = [parameter for name, parameter in model.named_parameters() if name == "codes"]
         others = [parameter for name, parameter in model.named_parameters() if name != "codes"]
         groups = [{"params": others, "lr": config.lr}, {"params": codes, "lr": config.code_lr}]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from avatar.checks import AvatarError, check_shape
 from avatar.data.outfits import Outfit
+from avatar.environment import prepared_process
 from avatar.geometry.chunks import UNIT, in_chunks
 from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.io.points import write_points
@@ -92,6 +93,7 @@ def join_clouds(parts: list[Prediction]) -> PointCloud:
     return PointCloud(points.float().cpu().numpy(), normals.float().cpu().numpy())
 
 
+@prepared_process()
 def predict_frames(
     avatar: TrainedAvatar, outfit: Outfit, split: str, folder: Path, points: int, keep: Callable[[str], bool] = bool
 ) -> list[Path]:
@@ -144,6 +146,7 @@ def outfit_index(avatar: TrainedAvatar, name: str) -> int:
     return avatar.config.outfit.index(name)
 
 
+@prepared_process()
 def predict_motion(avatar: TrainedAvatar, outfit: Outfit, motion: Motion, folder: Path, points: int) -> list[Path]:
     """Writes ``<folder>/<motion>.<frame>.ply`` for every frame of a motion; points keep their order over time."""
     index = outfit_index(avatar, outfit.name)

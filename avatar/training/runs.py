@@ -21,7 +21,7 @@ from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
-from avatar.environment import choose_device
+from avatar.environment import choose_device, prepared_process
 from avatar.io.documents import read_yaml
 from avatar.io.npz import write_whole
 from avatar.nn.closet import Skinning
@@ -112,6 +112,7 @@ class TrainedAvatar:
     seconds: float
 
 
+@prepared_process()
 def train_run(config: RunConfig) -> Path:
     """Trains a run, or goes on with it, and leaves its weights to share; gives the run's folder.
 

@@ -76,8 +76,8 @@ def test_decoder_is_asked_with_features_place_and_zeros():
     row, column = divmod(int(grid.pixels[pixel]), 32)
     pose = model.pose_encoder(model.atlas.position_map(batch.pose_vertices))[:, :, row, column]
     garment = model.garment_encoder(model.codes)[batch.outfit_ids][:, :, row, column]
-    place = torch.tensor([(column + 0.5) / 32, (row + 0.5) / 32, 0, 0]).expand(3, -1)
-    decoded = model.pose_decoder(torch.cat([pose, garment, place], dim=1)[:, None])
+    place = torch.tensor([[(column + 0.5) / 32, (row + 0.5) / 32, 0, 0]])
+    decoded = model.pose_decoder(torch.cat([pose, garment], dim=1)[:, None], place)
     torch.testing.assert_close(model(batch, sample).offsets, decoded.offsets * 0.02, rtol=1e-4, atol=1e-6)
 
 
@@ -191,12 +191,12 @@ def test_each_frame_is_decoded_from_its_own_outfit_and_pose(template):
     for frame, outfit in enumerate(batch.outfit_ids):
         garment = model.garment_features(model.codes[None, outfit], samples)
         pose = look_up(model.pose_encoder(model.atlas.position_map(batch.pose_vertices[None, frame])))
-        decoded = model.pose_decoder(torch.cat([pose, garment], dim=-1))
+        decoded = model.pose_decoder(torch.cat([pose, garment], dim=-1), model.places(samples))
         offsets = decoded.offsets[0] * config.offset_scale
         if template:
             torch.testing.assert_close(prediction.wrinkle_offsets[frame], offsets, rtol=1e-4, atol=1e-6)
             torch.testing.assert_close(prediction.wrinkle_normals[frame], decoded.normals[0], rtol=1e-4, atol=1e-5)
-            offsets = offsets + model.garment_decoder(garment).offsets[0] * config.offset_scale
+            offsets = offsets + model.garment_decoder(garment, model.places(samples)).offsets[0] * config.offset_scale
         torch.testing.assert_close(prediction.offsets[frame], offsets, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(prediction.codes, model.codes[1:])  # each outfit of the batch once
 

@@ -85,8 +85,7 @@ def test_points_agree_with_a_loop_over_them(pose_feature):
     for patch in (0, 17, 59):
         for cell in range(4):
             uv = (model.patch_corners[patch] + 0.5) / 16
-            asked = torch.cat([features[1, patch], uv, cells[cell]])
-            decoded = model.decoder(asked[None, None])
+            decoded = model.decoder(features[1:2, patch : patch + 1], torch.cat([uv, cells[cell]])[None])
             shift = frames[1, patch] @ decoded.offsets[0, 0]
             found = 4 * patch + cell
             torch.testing.assert_close(prediction.points[1, found], centres[1, patch] + shift, rtol=1e-3, atol=1e-4)

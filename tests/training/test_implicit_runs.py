@@ -26,7 +26,7 @@ from avatar.training.implicit_loop import ImplicitTrainConfig, ImplicitTrainer
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
 from avatar.training.implicit_runs import load_implicit, train_implicit
 from avatar.training.logs import read_log
-from avatar.training.loop import Schedule, TrainConfig
+from avatar.training.loop import Precision, Schedule, TrainConfig
 from avatar.training.runs import MethodChoice, RunConfig
 
 SETTINGS = {
@@ -253,6 +253,11 @@ def test_a_mesh_is_spread_into_points_by_area(frames, tiny_outfit):
     frame = canonical_frame(replace(tiny_outfit.load("train", tiny_outfit.frames("train")[0]), scan=scan))
     assert (frame.points[:, 2] < 0.5).float().mean() == pytest.approx(4 / 4.005, abs=1e-3)
     torch.testing.assert_close(frame.colors, frame.points / 4)
+
+
+def test_half_precision_is_refused_for_a_field_that_trains_in_float32():
+    with pytest.raises(AvatarError, match=r"train.precision: expected fp32 for scanimate, got bf16"):
+        train_implicit(RunConfig(train=TrainConfig(precision=Precision.bf16)))
 
 
 def test_what_is_wrong_is_refused_with_what_to_do(settings, trained, tmp_path):

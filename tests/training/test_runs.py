@@ -18,7 +18,8 @@ from avatar.nn.closet import ClosetConfig
 from avatar.settings import settings_from_dict
 from avatar.simulate.sequences import authored_motion
 from avatar.training.checkpoints import save_checkpoint
-from avatar.training.loop import Trainer
+from avatar.training.logs import read_log
+from avatar.training.loop import Precision, Trainer
 from avatar.training.prediction import (
     body_batch,
     outfit_index,
@@ -83,6 +84,20 @@ def test_learning_beats_the_static_floor_on_unseen_poses(settings, trained, tiny
     static = replace(settings, method=MethodChoice("closet", "static", SETTINGS | {"pose": False}))
     moving, still = held_out_error(trained, tiny_outfit), held_out_error(train_run(static), tiny_outfit)
     assert moving < 0.85 * still
+
+
+@pytest.mark.slow
+def test_training_in_half_precision_learns_what_float32_learns(settings, trained, tiny_outfit):
+    """`train.precision=bf16`, by autocast on the CPU: the loss falls, and unseen poses are about as good."""
+    narrow = replace(settings, name="bf16", train=replace(settings.train, precision=Precision.bf16))
+    folder = train_run(narrow)
+    rows = {each: read_log(each / "metrics.csv") for each in (trained, folder)}
+    first, *_, last = (float(row["loss"]) for row in rows[folder] if row["split"] == "train")
+    normals = [float(row["normal"]) for row in rows[folder] if row["split"] == "train"]
+    assert last < first and normals[-1] < 0.8 * normals[0]
+    wide, half = ([row for row in rows[each] if row["split"] == "validation"][-1] for each in (trained, folder))
+    assert wide["loss"] != half["loss"] and float(half["loss"]) == pytest.approx(float(wide["loss"]), rel=0.02)
+    assert held_out_error(folder, tiny_outfit) < 1.25 * held_out_error(trained, tiny_outfit)
 
 
 @pytest.mark.slow

@@ -107,6 +107,6 @@ class LookUp:
         return sum_bags(rows, self.bags, self.back if rows.requires_grad else None)
 
 
-def uv_and_patch(uv: Tensor, patch: Tensor, frames: int) -> Tensor:
-    """What POP's and SCALE's decoders know of a point's place: UV and patch coordinates ``(B, N, 4)``."""
-    return torch.cat([uv, patch], dim=-1).expand(frames, -1, -1)
+def uv_and_patch(uv: Tensor, patch: Tensor) -> Tensor:
+    """What POP's and SCALE's decoders know of a point's place: UV and patch coordinates ``(N, 4)``."""
+    return torch.cat([uv, patch], dim=-1)

@@ -92,9 +92,13 @@ class PopAvatar(nn.Module):
         return self.atlas.pixel_points(points) if self.config.points is PointSource.grid else None
 
     def garment_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
-        """Garment features and place of each point: ``(O, C, S, S)`` codes to ``(O, N, C + 4)``."""
-        uv, features = self.atlas.place(samples), self.atlas.look_up_at(samples)(self.garment_encoder(codes))
-        return torch.cat([features, uv_and_patch(uv, torch.zeros_like(uv), len(codes))], dim=-1)
+        """Garment features of each point: ``(O, C, S, S)`` codes to ``(O, N, C)``."""
+        return self.atlas.look_up_at(samples)(self.garment_encoder(codes))
+
+    def places(self, samples: SurfaceSamples) -> Tensor:
+        """UV and patch coordinates of each point, ``(N, 4)``."""
+        uv = self.atlas.place(samples)
+        return uv_and_patch(uv, torch.zeros_like(uv))
 
     def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
         """Predicts the dressed surface of each frame at template points.
@@ -113,15 +117,15 @@ class PopAvatar(nn.Module):
         outfits = batch.outfits
         row = torch.searchsorted(outfits, batch.outfit_ids)
         codes = pick(self.codes, outfits)
-        garment = self.garment_features(codes, samples)
+        garment, places = self.garment_features(codes, samples), self.places(samples)
         parts = []
         if self.config.template:
-            decoded = self.garment_decoder(garment)
+            decoded = self.garment_decoder(garment, places)
             parts.append(Decoded(pick(decoded.offsets, row), pick(decoded.normals, row)))
         if wrinkles:
             image = self.pose_encoder(self.atlas.position_map(batch.pose_vertices))
             pose = self.atlas.look_up_at(samples)(image)
-            parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1)))
+            parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1), places))
         parts = [Decoded(part.offsets.float() * self.config.offset_scale, part.normals.float()) for part in parts]
         local = sum(parts, bare_body(self.skin_normals, samples, self.config.normals))
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
@@ -147,7 +151,8 @@ class PopAvatar(nn.Module):
         """
         if not self.config.template:
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")
-        decoded = self.garment_decoder(self.garment_features(self.codes[outfit : outfit + 1], samples))
+        garment = self.garment_features(self.codes[outfit : outfit + 1], samples)
+        decoded = self.garment_decoder(garment, self.places(samples))
         dressed = bare_body(self.skin_normals, samples, self.config.normals) + decoded
         points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
         return Decoded(points, normalize(dressed.normals, dim=-1))

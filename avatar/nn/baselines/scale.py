@@ -21,6 +21,7 @@ from avatar.nn.baselines.atlas import Atlas, uv_and_patch
 from avatar.nn.baselines.unet import UNet, UNetConfig
 from avatar.nn.decoders import DecoderConfig, Normals, ShapeDecoder
 from avatar.nn.pointnet2 import point_mlp
+from avatar.nn.wide import WideLinear
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
 PLACE_CHANNELS = 4  # UV coordinates of the patch, and a point's own in the patch
@@ -73,7 +74,7 @@ class PointNet(nn.Module):
 
     def __init__(self, out_channels: int, config: PointNetConfig):
         super().__init__()
-        self.points = point_mlp((3, *config.points))
+        self.points = point_mlp((3, *config.points), WideLinear)
         layers, fan_in = [], config.points[-1]
         for width in config.body:  # no normalisation here: a batch of one body has nothing to normalise over
             layers += [nn.Linear(fan_in, width), nn.ReLU()]
@@ -182,10 +183,10 @@ class ScaleAvatar(nn.Module):
         pixels = spots.floor().long().clamp(0, size - 1)
         patch = self.patch_of_pixel[pixels[:, 1] * size + pixels[:, 0]]
         corners = self.patch_corners[patch]
-        place = uv_and_patch((corners + 0.5) / size, spots - corners, len(batch.vertices))
+        places = uv_and_patch((corners + 0.5) / size, spots - corners)
         features = self.pose_features(batch.pose_vertices)
         features = sum_bags(features, Bags.of_table(patch[:, None], features.shape[1]))
-        local = self.decoder(torch.cat([features.to(place.dtype), place], dim=-1))
+        local = self.decoder(features, places)
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
             frames = self.patch_frames(batch.vertices)[:, patch]
             offsets = transform_directions(frames, local.offsets.float())

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
+from avatar.nn.wide import WideConv2d
 
 SMOOTH_LEVELS = 3  # the last ones upsample and convolve, for transposed convolutions leave checkerboards
 WIDEST = 8  # times the first level's channels
@@ -60,7 +61,8 @@ class UNet(nn.Module):
         self.downs, self.ups = nn.ModuleList(), nn.ModuleList()
         for level, (fan_in, fan_out) in enumerate(itertools.pairwise([channels, *widths])):
             layers = [nn.LeakyReLU(0.2)] if level else []
-            layers.append(nn.Conv2d(fan_in, fan_out, 4, stride=2, padding=1, bias=False))
+            convolution = WideConv2d if level < 2 else nn.Conv2d  # positions until the first normalisation
+            layers.append(convolution(fan_in, fan_out, 4, stride=2, padding=1, bias=False))
             if 0 < level < config.levels - 1:
                 layers.append(nn.BatchNorm2d(fan_out, affine=config.affine))
             self.downs.append(nn.Sequential(*layers))

@@ -16,7 +16,7 @@ import torch
 
 from avatar.checks import AvatarError
 from avatar.data.outfits import SAFE_NAME
-from avatar.environment import choose_device
+from avatar.environment import choose_device, prepared_process
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.io.npz import write_whole
 from avatar.pipeline.benchmarks.avatars import predict_races, step_races
@@ -72,6 +72,7 @@ class BenchConfig:
             raise AvatarError(f"table: expected a plain name, got {self.table!r}.")
 
 
+@prepared_process()
 def bench(config: BenchConfig) -> Path:
     """Runs the benchmarks; writes ``<out>/<table>.csv``, ``.frames.csv`` (every round) and ``.md``, and gives the last.
 

@@ -47,6 +47,9 @@ from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.checkpoints import load_checkpoint, read_weights, save_checkpoint, write_weights
 from avatar.training.runs import RunConfig
 
+SCORE = 0.5  # validation score of the checkpoints
+SHARED = {"weight": torch.arange(64.0)}  # weights to share
+
 
 @dataclass(frozen=True)
 class Format:
@@ -254,13 +257,31 @@ def make_bvh(folder: Path) -> Path:
 
 
 def states() -> list[dict[str, Any]]:
-    """Two small states to save."""
-    return [{"model": {"weight": torch.full((64,), float(step))}, "step": step} for step in (1, 2)]
+    """Two small states to save, with all that a trainer's has."""
+
+    def state(step: int) -> dict[str, Any]:
+        moments = {"exp_avg": torch.full((64,), 0.1 * step), "step": torch.tensor(float(step))}
+        groups = [{"lr": 0.01 / step, "params": [0]}]
+        random = [{"cpu": torch.Generator().manual_seed(step).get_state()}]
+        model = {"weight": torch.full((64,), float(step)), "bias": torch.arange(4.0) * step}
+        return {
+            "model": model,
+            "optimiser": {"state": {0: moments}, "param_groups": groups},
+            "step": step,
+            "random": random,
+        }
+
+    return [state(step) for step in (1, 2)]
+
+
+def judge_checkpoint(state: Any) -> str:
+    """A state that a folder gave, against the two that were saved there."""
+    return judge_state(state, [{**saved, "score": SCORE} for saved in states()])
 
 
 def make_checkpoint(folder: Path) -> Path:
     """Two checkpoints; the newer is given."""
-    return [save_checkpoint(folder / "checkpoints", state, state["step"], 0.5) for state in states()][-1]
+    return [save_checkpoint(folder / "checkpoints", state, state["step"], SCORE) for state in states()][-1]
 
 
 def read_checkpoint(path: Path) -> Any:
@@ -269,10 +290,10 @@ def read_checkpoint(path: Path) -> Any:
 
 
 def respoil_checkpoint(data: bytes, rng: random.Random) -> bytes:
-    """A state of other content, packed by torch; `fuzzing` gives the file the name that its hash asks for."""
-    weight: Any = torch.full((64,), 2.0)
-    weight[rng.randrange(64)] = rng.choice((float("nan"), float("inf"), 3.0))
-    state: Any = {"model": {"weight": weight}, "step": rng.choice((2, -1, None, "2", 1e30)), "score": 0.5}
+    """A state of other content and step, packed by torch; `fuzzing` gives the file the name that its hash asks for."""
+    state: Any = {**states()[1], "step": rng.choice((3, -1, None, "2", 1e30)), "score": SCORE}
+    spoilt = rng.choice((state["model"]["weight"], state["optimiser"]["state"][0]["exp_avg"]))
+    spoilt[rng.randrange(64)] = rng.choice((float("nan"), float("inf"), 3.0))
     state = rng.choice((state, [state], {"model": 3}, {}, {**state, "score": "low"}))
     packed = io.BytesIO()
     torch.save(state, packed)
@@ -281,7 +302,7 @@ def respoil_checkpoint(data: bytes, rng: random.Random) -> bytes:
 
 def make_weights(folder: Path) -> Path:
     """Weights to share, with their description."""
-    write_weights(folder / "avatar", {"weight": torch.arange(64.0)}, {"steps": 3})
+    write_weights(folder / "avatar", SHARED, {"steps": 3})
     return folder / "avatar.safetensors"
 
 
@@ -293,7 +314,6 @@ def read_shared(path: Path) -> Any:
 def respoil_weights(data: bytes, rng: random.Random) -> bytes:
     """Weights with a number that is none; `fuzzing` describes them with their right hash."""
     spoilt = bytearray(data)
-    spoilt[-4 * rng.randint(1, 60) :][:4] = b"\x00\x00\xc0\x7f"
     place = len(spoilt) - 4 * rng.randint(1, 60)
     spoilt[place : place + 4] = rng.choice((b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\xff\xff\xff\xff"))
     return bytes(spoilt)
@@ -357,7 +377,7 @@ FORMATS = {
     "SMPL pkl": Format(make_model(".pkl"), convert, judge_body, respoil_pickle),
     "SMPL npz": Format(make_model(".npz"), convert, judge_body, respoil_arrays),
     "BVH": Format(make_bvh, read_bvh, judge_bvh),
-    "checkpoint": Format(make_checkpoint, read_checkpoint, judge_state, respoil_checkpoint),
-    "safetensors": Format(make_weights, read_shared, judge_weights, respoil_weights),
+    "checkpoint": Format(make_checkpoint, read_checkpoint, judge_checkpoint, respoil_checkpoint),
+    "safetensors": Format(make_weights, read_shared, lambda read: judge_weights(read, SHARED), respoil_weights),
     "config yaml": Format(make_config, read_config, judge_config, respoil_config),
 }

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
 from avatar.records import CanonicalScan, Mesh, Motion, PointCloud
+from avatar.settings import settings_to_dict
 from avatar.training.runs import RunConfig
 
 
@@ -79,7 +81,10 @@ def judge_garment(garment: Any) -> str:
 
 
 def judge_scan(scan: CanonicalScan) -> str:
-    """A canonical scan: points as any cloud's, weights that sum to 1, faces in range."""
+    """A canonical scan: points and normals as any cloud's, weights that sum to 1, faces in range."""
+    fault = judge_points(PointCloud(scan.points, scan.normals))
+    if fault:
+        return fault
     weights = scan.weights.astype(np.float64)
     if (weights < 0).any() or not (np.abs(weights.sum(axis=1) - 1) < 1e-2).all():
         return "weights do not sum to 1"
@@ -93,31 +98,66 @@ def judge_bvh(motion: Any) -> str:
     if not (np.isfinite(motion.positions).all() and np.isfinite(motion.rotations).all()):
         return "not finite"
     squares = motion.rotations @ np.swapaxes(motion.rotations, -1, -2)
-    return "" if np.abs(squares - np.eye(3)).max(initial=0) < 1e-6 else "no rotations"
+    turned = np.abs(squares - np.eye(3)).max(initial=0) < 1e-6 and (np.linalg.det(motion.rotations) > 0).all()
+    return "" if turned else "no rotations"
 
 
-def judge_state(state: Any) -> str:
-    """A checkpoint: finite, and where its step is that of one which was saved, to the bit what was saved."""
+def leaves(value: Any, name: str = "") -> dict[str, Any]:
+    """All that nested dicts and lists hold, tensors and plain values, by its place."""
+    if isinstance(value, (dict, list, tuple)) and value:
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return {place: leaf for key, item in items for place, leaf in leaves(item, f"{name}/{key!r}").items()}
+    return {name: value}
+
+
+def bits(value: Any) -> dict[str, tuple]:
+    """The leaves of a value to be compared to the bit: type, shape and bytes of tensors, type and digits of others."""
+    return {
+        place: (str(leaf.dtype), tuple(leaf.shape), leaf.detach().cpu().contiguous().numpy().tobytes())
+        if isinstance(leaf, torch.Tensor)
+        else (type(leaf).__name__, repr(leaf))
+        for place, leaf in leaves(value).items()
+    }
+
+
+def difference(found: Any, saved: Any) -> str:
+    """The first place where two states are not equal to the bit; nothing where they are."""
+    one, other = bits(found), bits(saved)
+    return next((place for place in sorted(one.keys() | other.keys()) if one.get(place) != other.get(place)), "")
+
+
+def judge_state(state: Any, saved: Sequence[dict[str, Any]]) -> str:
+    """A checkpoint: every tensor finite; where its step is that of one which was ``saved``, to the bit what was saved.
+
+    That is all of it: model, optimiser, random state and plain values. A state of another step is a forgery with its
+    right hash, which nobody can tell from a checkpoint of another run.
+    """
     if not isinstance(state, dict):
         return "no state"
-    weight = state.get("model", {}).get("weight") if isinstance(state.get("model"), dict) else None
-    if isinstance(weight, torch.Tensor) and not bool(torch.isfinite(weight).all()):
+    tensors = [leaf for leaf in leaves(state).values() if isinstance(leaf, torch.Tensor)]
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors):
         return "not finite"
-    return ""
+    twins = [each for each in saved if each["step"] == state.get("step")]
+    wrong = difference(state, twins[0]) if twins else ""
+    return f"not what was saved: {wrong}" if wrong else ""
 
 
-def judge_weights(read: tuple[dict[str, torch.Tensor], dict[str, Any]]) -> str:
-    """Weights: finite."""
-    return "" if all(bool(torch.isfinite(value).all()) for value in read[0].values()) else "not finite"
+def judge_weights(read: tuple[dict[str, torch.Tensor], dict[str, Any]], saved: dict[str, torch.Tensor]) -> str:
+    """Weights: to the bit what was ``saved``, which is finite."""
+    wrong = difference(read[0], saved)
+    return f"not what was saved: {wrong}" if wrong else ""
 
 
 def judge_config(config: RunConfig) -> str:
-    """Settings: plain names, finite numbers of the declared kinds."""
+    """Settings: plain names, finite numbers, and those that size the work of the declared kinds and in range."""
+    for name, value in leaves(settings_to_dict(config)).items():
+        if isinstance(value, float) and not np.isfinite(value):
+            return f"not finite: {name}"
     names = [config.name, config.dataset, config.method.variant, config.canonical, *config.outfit]
     if any(type(name) is not str or not name or name[0] == "." or set(name) & set("/\\\0~ \n") for name in names):
         return "unsafe name"
     train = config.train
     whole = (train.steps, train.batch, train.points, train.scan_points, train.seed)
-    if not all(type(value) is int for value in whole) or not all(np.isfinite((train.lr, train.code_lr))):
+    if not all(type(value) is int for value in whole):
         return "wrong kinds"
     return "" if min(whole[:4]) >= 1 and train.lr > 0 else "out of range"

@@ -11,9 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from avatar.pipeline.torture.damage import digest, load_quietly
 from avatar.pipeline.torture.findings import Finding, all_of
 from avatar.pipeline.torture.miniature import JOBS, SAVE_EVERY, STEPS, folder_of, prepare, train_job, weights_digest
 from avatar.pipeline.torture.victims import Victim, run_victim, wait_until, work_alone
+from avatar.training import cycles, implicit_loop, loop
 from avatar.training.checkpoints import read_manifest
 from avatar.training.logs import read_log
 
@@ -32,12 +34,13 @@ def kill_trial(root: Path, kills: int, in_saves: int, seed: int) -> list[Finding
     """
     work_alone(prepare, root)
     rng = random.Random(seed)
-    whole, length = {}, {}
+    whole, states, length = {}, {}, {}
     for job in JOBS:
         started = time.monotonic()
         work_alone(train_job, job, root, "whole")
         length[job], whole[job] = time.monotonic() - started, weights_digest(folder_of(job, root, "whole"))
-    killed = resumed = equal = saving = 0
+        states[job] = digest(load_quietly(folder_of(job, root, "whole") / "checkpoints"))
+    killed = resumed = equal = alike = saving = 0
     lost = 0
     for trial in range(kills):
         job, name = JOBS[trial % len(JOBS)], f"killed-{trial}"
@@ -57,29 +60,43 @@ def kill_trial(root: Path, kills: int, in_saves: int, seed: int) -> list[Finding
         lost = max(lost, steps_lost(folder))
         resumed += run_victim(train_job, job, root, name).code == 0
         equal += weights_digest(folder) == whole[job]
+        alike += digest(load_quietly(folder / "checkpoints")) == states[job]
         shutil.rmtree(folder)
     return [
         Finding("kill", "trainings killed with -9 before their end", killed, f"of {kills}", kills, kills, kills),
         Finding("kill", "of these inside a save", saving, f"of {kills}", kills, in_saves, None),
         all_of("kill", "finished by the same command", resumed, kills),
         all_of("kill", "final weights equal to the uninterrupted run's, by sha256", equal, kills),
+        all_of("kill", "last checkpoints equal to its, to the bit: model, optimiser, random state", alike, kills),
         Finding("kill", "steps to do again at most (saved every 4)", lost, "steps", kills, None, SAVE_EVERY),
     ]
 
 
 def train_until_save(job: str, root: Path, name: str, place: int) -> None:
     """Trains until the checkpoints' ``place``-th call to the disk, and dies in its stead."""
-    left = iter(range(place + 1))
+    left, saving = iter(range(place + 1)), []
 
     def deadly(real: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **options: Any) -> Any:
-            if (folder_of(job, root, name) / "checkpoints").is_dir() and next(left, None) == place:
+            if saving and next(left, None) == place:
                 os.kill(os.getpid(), signal.SIGKILL)
             return real(*arguments, **options)
 
         return call
 
+    def watched(save: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            saving.append(True)
+            try:
+                return save(*arguments, **options)
+            finally:
+                saving.pop()
+
+        return call
+
     os.fsync, Path.replace = deadly(os.fsync), deadly(Path.replace)
+    for module in (cycles, implicit_loop, loop):
+        module.save_checkpoint = watched(module.save_checkpoint)
     train_job(job, root, name)
 
 

@@ -73,7 +73,7 @@ def name_trial(root: Path, count: int, seed: int) -> list[Finding]:
 
 def try_names(root: Path, names: list[str]) -> dict[str, list[str]]:
     """The names by which something was written outside ``data`` and ``runs`` below the root, and those that crashed."""
-    allowed = tuple(str((root / part).resolve()) for part in ("data", "runs"))
+    allowed = [(root / part).resolve() for part in ("data", "runs")]
     written: list[str] = []
     (root / "data" / "link").unlink(missing_ok=True)
     (root / "data" / "link").symlink_to("/tmp")
@@ -91,7 +91,7 @@ def try_names(root: Path, names: list[str]) -> dict[str, list[str]]:
                 continue
             except Exception as error:
                 untyped.append(f"{name!r} {error!r:.300}")
-        strays = [path for path in written if not os.path.realpath(path).startswith(allowed)]
+        strays = [path for path in written if not any(Path(os.path.realpath(path)).is_relative_to(a) for a in allowed)]
         outside += [f"{name!r} {strays[:3]}"] if strays else []
     return {"outside": outside, "untyped": untyped}
 

@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from avatar.pipeline.torture.findings import Finding, all_of, none_of
+from avatar.pipeline.torture.judges import bits
 from avatar.pipeline.torture.miniature import JOBS, STEPS, folder_of, prepare, train_job, weights_digest
 from avatar.pipeline.torture.victims import run_victim, work_alone
 from avatar.training import cycles, implicit_loop, loop
@@ -43,8 +44,8 @@ def poison_trial(root: Path, poisons: int, seed: int) -> list[Finding]:
         job, place, once = cases[number % len(cases)]
         name, folder = f"poisoned-{number}", folder_of(job, root, f"poisoned-{number}")
         outcome = run_victim(train_poisoned, job, root, name, place, once, rng.randrange(2, STEPS - 12))
-        spread = root / f"{name}.spread"  # left by a step that let the poison into sound weights
-        caught += not spread.exists()
+        given, spread = (root / f"{name}.{what}" for what in ("given", "spread"))
+        caught += given.exists() and not spread.exists()
         ended += outcome.code in (0, 2)
         written += not all_finite(folder)
         if outcome.code == 2:
@@ -60,7 +61,11 @@ def poison_trial(root: Path, poisons: int, seed: int) -> list[Finding]:
 
 
 def train_poisoned(job: str, root: Path, name: str, place: str, once: bool, step: int) -> None:
-    """Trains with poison in one place at a step, or from it on."""
+    """Trains with poison in one place at a step, or from it on.
+
+    Leaves ``<root>/<name>.given`` where a step was poisoned: its loss or gradients were not finite; and
+    ``<root>/<name>.spread`` where such a step changed a weight, a statistic or a moment.
+    """
     state = {"step": -1, "trainer": None}
 
     def due() -> bool:
@@ -74,10 +79,13 @@ def train_poisoned(job: str, root: Path, name: str, place: str, once: bool, step
                 largest.data.view(-1)[0] = math.nan  # a small one, such as a frame's code, is in few batches
             if place == "scan point" and due() and batch:
                 batch = (poison_points(batch[0]),)
-            before = [parameter.detach().clone() for parameter in trainer.model.parameters()] if due() else []
+            before = bits(held_by(trainer)) if due() else {}
             result = real(trainer, *batch)
-            for old, new in zip(before, trainer.model.parameters()):
-                if not torch.equal(old.nan_to_num(7.0), new.detach().nan_to_num(7.0)):
+            if before:
+                if not math.isfinite(float(result[-1]) + float(result[0].total.detach())):
+                    (root / f"{name}.given").touch()
+                after = bits(held_by(trainer))
+                if any(after.get(place, old) != old for place, old in before.items()):
                     (root / f"{name}.spread").touch()
             return result
 
@@ -87,6 +95,11 @@ def train_poisoned(job: str, root: Path, name: str, place: str, once: bool, step
         kind.train_step = watched(kind.train_step)
     poison_functions(place, due, state)
     train_job(job, root, name)
+
+
+def held_by(trainer: Any) -> dict[str, Any]:
+    """What a step may change: weights and statistics of a trainer's network, and its optimiser's moments."""
+    return {"model": trainer.model.state_dict(), "moments": trainer.optimiser.state_dict()["state"]}
 
 
 def poison_functions(place: str, due: Callable[[], bool], state: dict[str, Any]) -> None:

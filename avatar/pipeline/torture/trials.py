@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 from avatar.checks import AvatarError, check_name
+from avatar.environment import prepared_process
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.io.documents import read_json
 from avatar.io.npz import write_whole
@@ -86,6 +87,7 @@ TRIALS: dict[str, tuple[tuple[str, ...], Callable[[TortureConfig, Path], list[Fi
 }
 
 
+@prepared_process()
 def torture(config: TortureConfig) -> Path:
     """Runs the trials that are asked for and not done yet; gives the table, ``<out>/reliability.md``.
 
