@@ -13,7 +13,7 @@ from avatar.checks import DataError
 from avatar.records import Template
 
 JOINT_GAP, JOINTS_GAP = 0.25, 0.12  # metres from a joint to its weights' border: one, median (open body: 0.13, 0.04)
-APART, SHARE = 0.05, 0.99  # metres between two posed bodies at that share of their vertices; lost blendshapes: 0.03
+APART, SHARE = 0.05, 0.99  # metres between two posed bodies at that share of their vertices: room for lost blendshapes
 EDGE_ERROR = 0.18  # of the edges' length: 0.03 to 0.10 where right (sample outfits), 0.27 and more for no rotation
 
 
