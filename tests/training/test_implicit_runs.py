@@ -222,6 +222,14 @@ def test_batches_depend_on_nothing_but_the_step(frames):
     seen = [name for step in range(3) for name in one.batch_at(step, 2).names]
     assert sorted(seen) == sorted(frame.name for frame in frames)  # an epoch is every frame once
     assert not torch.equal(one.item(0, "1").points, one.item(0, "2").points)
+    epochs = {tuple(one.batch_at(step, len(frames)).names) for step in range(4)}
+    assert len(epochs) > 1 and {tuple(sorted(epoch)) for epoch in epochs} == {tuple(sorted(seen))}
+    batch, named = one.batch_at(7, 2), {frame.name: frame for frame in frames}
+    for row, frame in enumerate(named[name] for name in batch.names):
+        places = cKDTree(frame.points).query(batch.points[row])[1]
+        torch.testing.assert_close(batch.normals[row], frame.normals[places])
+        torch.testing.assert_close(batch.colors[row], frame.colors[places])
+        assert torch.equal(batch.joint_transforms[row], frame.joint_transforms)
     assert torch.equal(one.ordered()[0].points, one.ordered()[0].points)
 
 
