@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from avatar.geometry.neighbours import fused_search, k_nearest, nearest
+from avatar.geometry.neighbours import fused_search, k_nearest, nearest, try_fused
 
 ROOT = Path(__file__).parents[2]
 
@@ -63,11 +63,34 @@ def test_search_compiles_for_devices_that_are_not_here(tmp_path):
     assert done.stdout.strip() == "compiles", done.stderr
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="what happens without CUDA")
-def test_where_it_cannot_run_the_slow_way_is_taken_with_a_warning(caplog):
+def test_a_search_that_fails_once_is_tried_again(monkeypatch, caplog):
+    """What a busy driver or a full disk refuses is not given up for good, and is warned of once for each kind."""
+    failures = [RuntimeError("busy"), RuntimeError("busy"), OSError("full"), None]
+    queries, points = torch.randn(1, 5, 3), torch.randn(1, 7, 3)
+
+    def search(queries, points):
+        if failure := failures.pop(0):
+            raise failure
+        return torch.full(queries.shape[:2], 3)
+
+    monkeypatch.setattr("avatar.geometry.neighbours.fused_search", lambda: search)
+    monkeypatch.setattr("avatar.geometry.neighbours.WARNED", set())
+    assert [try_fused(queries, points) for _ in range(3)] == [None] * 3
+    assert torch.equal(try_fused(queries, points), torch.full((1, 5), 3))
+    warned = [record.getMessage() for record in caplog.records]
+    assert len(warned) == 2 and "RuntimeError: busy" in warned[0] and "OSError: full" in warned[1]
+
+
+def test_without_triton_nothing_is_tried_and_a_warning_says_so(monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "triton", None)
+    monkeypatch.delitem(sys.modules, "avatar.geometry.kernels", raising=False)
+    monkeypatch.setattr("avatar.geometry.neighbours.WARNED", set())
     fused_search.cache_clear()
-    assert fused_search() is None and "slow way" in caplog.text
-    fused_search.cache_clear()
+    try:
+        assert fused_search() is None and try_fused(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3)) is None
+    finally:
+        fused_search.cache_clear()
+    assert len(caplog.records) == 1 and "slow way" in caplog.text and "triton" in caplog.text
 
 
 @pytest.mark.gpu

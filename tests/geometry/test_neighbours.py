@@ -3,14 +3,25 @@
 import time
 
 import numpy as np
+import pretended
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import ball_loop, nearest_loop
+from torch.utils._pytree import tree_map
 
 from avatar.checks import AvatarError
-from avatar.geometry.neighbours import _k_nearest_chunked, ball_query, k_nearest, nearest, nearest_both_ways
+from avatar.geometry import neighbours
+from avatar.geometry.neighbours import (
+    FixedPoints,
+    _build_tree,
+    _k_nearest_chunked,
+    ball_query,
+    k_nearest,
+    nearest,
+    nearest_both_ways,
+)
 
 
 def cloud(batch: int, count: int, seed: int) -> torch.Tensor:
@@ -124,3 +135,25 @@ def test_full_size_search_is_fast():
     start = time.process_time()
     nearest(q, p)
     assert time.process_time() - start < 1.0
+
+
+@pytest.mark.parametrize("device", ["cpu", pretended.NAME])
+def test_fixed_points_are_searched_as_others_and_their_tree_is_built_once(monkeypatch, device):
+    points, queries = cloud(1, 60, 0), cloud(3, 40, 1)
+    expected = k_nearest(queries, points.expand(3, -1, -1), 4)
+    built = []
+    monkeypatch.setattr(neighbours, "_build_tree", lambda *given: built.append(1) or _build_tree(*given))
+    fixed = FixedPoints(points[0])
+    for _ in range(3):
+        assert torch.equal(fixed.k_nearest(queries.to(device), 4).cpu(), expected)
+    assert len(built) == (device == "cpu")
+    with pytest.raises(AvatarError, match="k of 1 to the 60 points"):
+        fixed.k_nearest(queries, 61)
+
+
+@pytest.mark.parametrize("search", [k_nearest, nearest_both_ways])
+def test_a_device_searches_by_itself(search):
+    points, queries = cloud(2, 50, 0), cloud(2, 40, 1)
+    more = (3,) if search is k_nearest else ()
+    there = search(queries.to(pretended.NAME), points.to(pretended.NAME), *more)
+    torch.testing.assert_close(tree_map(torch.Tensor.cpu, there), search(queries, points, *more))

@@ -21,6 +21,7 @@ from avatar.data.batches import FrameDataset
 from avatar.data.scanner import ScanConfig
 from avatar.evaluation.canonical_scores import CANONICAL_METRICS
 from avatar.evaluation.scores import read_scores
+from avatar.geometry import neighbours
 from avatar.geometry.transforms import transform_points
 from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.meshes import read_mesh
@@ -68,6 +69,17 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path, monkeyp
     assert again.step == 12
     for name, value in whole.model.state_dict().items():
         assert torch.equal(value, again.model.state_dict()[name]), name
+
+
+def test_the_tree_over_the_body_at_rest_is_built_once(tmp_path, monkeypatch):
+    built = []
+    build = neighbours._build_tree
+    monkeypatch.setattr(neighbours, "_build_tree", lambda cloud: built.append(len(cloud)) or build(cloud))
+    trainer = make_trainer(tmp_path)
+    trainer.fit()
+    assert built == [len(TEMPLATE.vertices)]
+    find_code(trainer.model, TEMPLATE, SCANS[0], trainer.model.codes[0], replace(trainer.config, code_steps=5))
+    assert len(built) == 2
 
 
 def test_log_names_every_term_and_the_cycle_only_where_it_is_learned(tmp_path):
