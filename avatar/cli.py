@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import os
+import select
 import signal
 import sys
 from pathlib import Path
@@ -113,9 +114,9 @@ def silence_closed_streams() -> bool:
     """Turns streams whose reader has left to nowhere, so that the interpreter's last flush is quiet; were there any?"""
     found = False
     for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except BrokenPipeError:
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)  # errors and hang-ups are always reported
+        if any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
             found = True
     return found
