@@ -1,7 +1,5 @@
 """The doctor: what is there, what is missing, and the line that mends it."""
 
-import ast
-import importlib
 import inspect
 import json
 import os
@@ -22,6 +20,7 @@ from avatar.training.implicit_prediction import predict_implicit_frames, predict
 from avatar.training.implicit_runs import train_implicit
 from avatar.training.prediction import predict_frames, predict_motion
 from avatar.training.runs import RunConfig, flatten, train_run
+from avatar.verbs import VERBS, resolve
 
 ROOT = Path(__file__).parents[1]
 
@@ -83,7 +82,7 @@ def test_every_verb_keeps_freed_memory_for_what_comes_next():
         "    for _ in range(3): torch.ones(1 << 24)\n"
         "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before\n"
         "print(min(faults() for _ in range(8)))\n"
-        "command('bench', lambda config: print(min(faults() for _ in range(8))))"
+        "command('bench', lambda config: print(min(faults() for _ in range(8))) or [])"
     )
     thrown_away, kept = map(int, in_fresh_python(code).stdout.split())
     assert thrown_away > 3 * 10_000 and kept < 1000
@@ -104,7 +103,7 @@ def test_every_verb_takes_the_smallest_numbers_for_zero_in_all_threads():
     code = LEFT + (
         "from avatar.config import command\n"
         "print(left())\n"
-        "try: command('bench', lambda config: print(left()))\n"
+        "try: command('bench', lambda config: print(left()) or [])\n"
         "except SystemExit: print(left())"
     )
     assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.split() == [str(1 << 20), "0", str(1 << 20)]
@@ -150,17 +149,10 @@ def test_who_imports_torch_too_early_is_warned_once(first):
 
 
 def test_all_that_verbs_and_callers_of_the_package_start_prepares_the_process():
-    """Every function that a tool gives to `command`, and those that the docs call from Python."""
+    """Every verb with settings, and the functions that the docs call from Python."""
     started = [train_run, train_implicit, train_canonicalizer, canonicalize_frames, fit_outfit]
     started += [predict_frames, predict_motion, predict_implicit_frames, predict_implicit_motion]
-    for tool in sorted((ROOT / "tools").glob("*.py")):
-        tree = ast.parse(tool.read_text())
-        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-        names = [call.args[1].id for call in calls if getattr(call.func, "id", "") == "command"]
-        homes = {
-            alias.name: node.module for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names
-        }
-        started += [getattr(importlib.import_module(homes[name]), name) for name in names]
+    started += [resolve(verb.run) for name, verb in VERBS.items() if verb.settings and name != "parameters"]
     assert len(started) > 20
     bare = [f.__qualname__ for f in started if not inspect.getsource(f).startswith("@prepared_process()")]
     assert bare == []
@@ -177,7 +169,14 @@ def test_a_run_from_python_has_the_bits_of_the_command_s(tmp_path):
     line += [f"method.settings.{name}={json.dumps(value)}" for name, value in flatten(config.method.settings).items()]
     words = [word for word in line if not word.startswith("method.name") and not word.endswith("=null")]
     options = {"OMP_NUM_THREADS": "2"}
-    command = [sys.executable, str(ROOT / "tools" / "train.py"), "method=scanimate", *words, "name=command"]
+    command = [
+        sys.executable,
+        str(ROOT / "tools" / "train.py"),
+        "method=scanimate",
+        "size=full",
+        *words,
+        "name=command",
+    ]
     done = subprocess.run(command, cwd=tmp_path, env=os.environ | options, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     code = (
