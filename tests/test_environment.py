@@ -1,7 +1,6 @@
 """The doctor: what is there, what is missing, and the line that mends it."""
 
 import inspect
-import json
 import os
 import platform
 import subprocess
@@ -12,17 +11,17 @@ import pytest
 
 from avatar.environment import inspect_package, mending_line
 from avatar.invocation import interpreter
-from avatar.pipeline.torture.miniature import folder_of, prepare, run_config, weights_digest
-from avatar.settings import settings_to_dict
+from avatar.pipeline.torture.miniature import prepare, weights_digest
 from avatar.training.canonicalizing import canonicalize_frames, train_canonicalizer
 from avatar.training.fitting import fit_outfit
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
 from avatar.training.implicit_runs import train_implicit
 from avatar.training.prediction import predict_frames, predict_motion
-from avatar.training.runs import RunConfig, flatten, train_run
+from avatar.training.runs import train_run
 from avatar.verbs import VERBS, resolve
 
 ROOT = Path(__file__).parents[1]
+TWO_THREADS = {"OMP_NUM_THREADS": "2"}
 
 
 def test_a_package_that_is_there_is_named_with_its_version():
@@ -106,7 +105,7 @@ def test_every_verb_takes_the_smallest_numbers_for_zero_in_all_threads():
         "try: command('bench', lambda config: print(left()) or [])\n"
         "except SystemExit: print(left())"
     )
-    assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.split() == [str(1 << 20), "0", str(1 << 20)]
+    assert in_fresh_python(code, **TWO_THREADS).stdout.split() == [str(1 << 20), "0", str(1 << 20)]
 
 
 @X86
@@ -121,7 +120,7 @@ def test_blocks_of_a_prepared_process_may_be_nested_and_left_by_errors():
         "try: work(0)\n"
         "except KeyError: print(left())"
     )
-    assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.split() == ["0", "0", str(1 << 20)]
+    assert in_fresh_python(code, **TWO_THREADS).stdout.split() == ["0", "0", str(1 << 20)]
 
 
 @X86
@@ -136,7 +135,7 @@ def test_a_fork_does_not_wait_for_its_parents_threads():
         "if child == 0: os._exit(found and 3)\n"
         "print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))"
     )
-    assert in_fresh_python(code, OMP_NUM_THREADS="2").stdout.strip() == "0"
+    assert in_fresh_python(code, **TWO_THREADS).stdout.strip() == "0"
 
 
 @pytest.mark.parametrize("first", ["torch", "avatar"])
@@ -162,35 +161,28 @@ def test_all_that_verbs_and_callers_of_the_package_start_prepares_the_process():
 def test_a_run_from_python_has_the_bits_of_the_command_s(tmp_path):
     """Training whose numbers fall below 1e-38, in two threads, after other work with torch."""
     prepare(tmp_path)
-    config = run_config("scanimate", tmp_path, steps=6)
-    wanted, defaults = flatten(settings_to_dict(config)), flatten(settings_to_dict(RunConfig()))
-    line = [f"{name}={json.dumps(value, default=str)}" for name, value in wanted.items()]
-    line = [word for word in line if not word.startswith("method.settings") and word.split("=")[0] in defaults]
-    line += [f"method.settings.{name}={json.dumps(value)}" for name, value in flatten(config.method.settings).items()]
-    words = [word for word in line if not word.startswith("method.name") and not word.endswith("=null")]
-    options = {"OMP_NUM_THREADS": "2"}
-    command = [
-        sys.executable,
-        str(ROOT / "tools" / "train.py"),
-        "method=scanimate",
-        "size=full",
-        *words,
-        "name=command",
-    ]
-    done = subprocess.run(command, cwd=tmp_path, env=os.environ | options, capture_output=True, text=True)
+    small = ["sdf.widths=[16,16,16]", "sdf.skip=1", "sdf.orders=2", "gate_spacing=0.1"]
+    line = [sys.executable, str(ROOT / "tools" / "train.py"), "method=scanimate", "dataset=open", "outfit=tee"]
+    line += [f"data_root={tmp_path / 'data'}", f"runs_root={tmp_path / 'runs'}", "canonical=nearest", "device=cpu"]
+    line += ["train.steps=6", "train.batch=2", "train.scan_points=300", "scan.points=1000", "name=command"]
+    line += [f"method.settings.avatar.{option}" for option in small]
+    done = subprocess.run(line, cwd=tmp_path, env=os.environ | TWO_THREADS, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    folder = tmp_path / "runs" / "scanimate" / "open" / "tee" / "command"
     code = (
         "import sys, torch\n"
         "torch.ones(1 << 20).exp().sum()  # two OpenMP threads are there before the package is\n"
+        "from dataclasses import replace\n"
         "from pathlib import Path\n"
-        "from avatar.pipeline.torture.miniature import run_config\n"
+        "from avatar.io.documents import read_yaml\n"
+        "from avatar.settings import settings_from_dict\n"
         "from avatar.training.implicit_runs import train_implicit\n"
-        "train_implicit(run_config('scanimate', Path(sys.argv[1]), 'python', steps=6))"
+        "from avatar.training.runs import RunConfig\n"
+        "config = settings_from_dict(RunConfig, read_yaml(Path(sys.argv[1]) / 'config.yaml'))\n"
+        "train_implicit(replace(config, name='python'))"
     )
-    in_fresh_python(code, str(tmp_path), **options)
-    assert weights_digest(folder_of("scanimate", tmp_path, "command")) == weights_digest(
-        folder_of("scanimate", tmp_path, "python")
-    )
+    in_fresh_python(code, str(folder), **TWO_THREADS)
+    assert weights_digest(folder) == weights_digest(folder.with_name("python")) != ""
 
 
 @pytest.mark.slow

@@ -100,12 +100,18 @@ def step_outfits(outfit_ids: Tensor, outfits: int, team: Team) -> Tensor:
     return seen.nonzero()[:, 0].to(outfit_ids.device)
 
 
-def gradients_of(model: nn.Module) -> list[Tensor]:
-    """The gradients of a model, zero for a parameter this process did not come by, so that all lists are alike."""
-    for parameter in model.parameters():
-        if parameter.requires_grad and parameter.grad is None:
-            parameter.grad = torch.zeros_like(parameter)
-    return [parameter.grad for parameter in model.parameters() if parameter.requires_grad]
+def gradients_of(model: nn.Module, team: Team) -> list[Tensor]:
+    """The gradients of a model, zero where only other processes have one, so that the lists of all are alike.
+
+    Parameters that have none in any process (of a loss term that is off) are left without: Adam would count a step.
+    """
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    shares = torch.tensor([float(parameter.grad is not None) for parameter in parameters])
+    average([shares], team)
+    found = [parameter for parameter, share in zip(parameters, shares.tolist()) if share > 0]
+    for parameter in found:
+        parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+    return [parameter.grad for parameter in found]
 
 
 def gather(value: Any, team: Team) -> list[Any]:

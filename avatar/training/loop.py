@@ -228,7 +228,7 @@ class Trainer:
         terms.total.backward()
         total = terms.total.detach().clone()
         if self.team.size > 1:
-            average([*gradients_of(self.model), total], self.team)
+            average([*gradients_of(self.model, self.team), total], self.team)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.config.clip or math.inf)
         if bool(torch.isfinite(norm + total)):
             self.optimiser.step()

@@ -53,7 +53,7 @@ def make_trainer(folder: Path, steps: int, **options) -> Trainer:
     torch.manual_seed(5 + current_team().rank)
     model = ClosetAvatar(TEMPLATE, 1, small_config()).double()
     defaults = {"points": 60, "scan_points": 50, "batch": FRAMES, "log_every": 1, "fresh_points": True, "lr": 3e-4}
-    loss = LossConfig(normal_start=0.0)  # a millionth of a gradient is lost in rounding, and Adam makes steps of it
+    loss = LossConfig(normal_start=0.04)  # from the second step, whether the budget ends at 12 or at 20
     config = TrainConfig(steps=steps, save_every=6, validate_every=8, loss=loss, **(defaults | options))
     return Trainer(model, TEMPLATE.vertices, TEMPLATE.faces, config, folder)
 
@@ -109,7 +109,7 @@ def outfit_errors(folder: Path, team: Team) -> dict[str, float]:
         for case, outfits in SHARES.items():
             whole, alone = part(random_batch(FRAMES, outfits)), two_outfits(method)
             trainer = Trainer(two_outfits(method), TEMPLATE.vertices, TEMPLATE.faces, config, folder)
-            terms, _, norm = trainer.train_step(part(whole, team.share(FRAMES)))
+            terms, _, norm = trainer.train_step(part(whole, team.share(FRAMES)), trainer.samples_at(0))
             expected = point_avatar_loss(alone(whole, trainer.samples_at(0)), whole, loss, 0.0)
             expected.total.backward()
             logged = trainer.team_mean({name: float(value.detach()) for name, value in terms.raw.items()})
@@ -130,7 +130,10 @@ def norms_after_a_bad_frame(folder: Path, team: Team) -> list[float]:
     broken = replace(whole, vertices=whole.vertices.clone())
     broken.vertices[-1] = torch.nan
     trainer = Trainer(two_outfits("closet"), TEMPLATE.vertices, TEMPLATE.faces, config, folder)
-    return [float(trainer.train_step(part(batch, team.share(FRAMES)))[2]) for batch in (broken, whole)]
+    return [
+        float(trainer.train_step(part(batch, team.share(FRAMES)), trainer.samples_at(0))[2])
+        for batch in (broken, whole)
+    ]
 
 
 def main(folder: Path, steps: int) -> None:

@@ -129,7 +129,7 @@ def test_each_stage_follows_its_own_schedule(tmp_path, monkeypatch):
     drawn = []
     for trainer.step in range(12):
         drawn.append(trainer.batch_at(trainer.step).points[:, 0])
-        trainer.train_step()
+        trainer.train_step(trainer.batch_at(trainer.step))
     rates, together, progress = zip(*seen)
     assert rates == pytest.approx([0.01] * 2 + [1e-3, 1e-4] + [0.002] * 4 + [2e-4] * 2 + [2e-5] * 2)
     assert together == (False,) * 4 + (True,) * 8
@@ -142,7 +142,7 @@ def test_clipping_shortens_the_gradient_before_the_step(tmp_path):
     norms, moved = [], []
     for trainer in (free, clipped):
         before = [value.detach().clone() for value in trainer.model.parameters()]
-        norms.append(trainer.train_step()[1])
+        norms.append(trainer.train_step(trainer.batch_at(trainer.step))[1])
         moved.append(max(float((a.detach() - b).abs().max()) for a, b in zip(trainer.model.parameters(), before)))
     assert norms[0] == norms[1] > 1e-3  # logged unclipped
     assert moved[0] == pytest.approx(4e-3, rel=1e-2) and moved[1] < 4e-4  # Adam's first step is as long as the rate

@@ -182,7 +182,7 @@ def test_clipping_shortens_the_gradient_before_the_step(make_trainer, frames):
     for clip in (None, 1e-9):
         trainer = make_trainer(clip=clip, lr=1e-3, steps=8)
         before = [value.detach().clone() for value in trainer.learned]
-        norms.append(trainer.train_step(batch)[1])
+        norms.append(trainer.train_step(batch, trainer.space_at(batch, 0))[1])
         moved.append(max(float((a.detach() - b).abs().max()) for a, b in zip(trainer.learned, before)))
     assert norms[0] == norms[1] > 1e-3  # logged unclipped
     assert moved[0] == pytest.approx(1e-3, rel=1e-2) and moved[1] < 1e-4  # Adam's first step is as long as the rate

@@ -179,7 +179,7 @@ def test_normals_are_not_trained_before_their_term_starts(tmp_path):
     before = [value.clone() for value in last]
     for step in range(10):
         trainer.step = step
-        trainer.train_step(random_batch())
+        trainer.train_step(random_batch(), trainer.samples_at(trainer.step))
         moved = not all(torch.equal(value, old) for value, old in zip(last, before))
         assert moved == (step >= 5)
 
@@ -188,7 +188,7 @@ def changes(trainer: Trainer) -> dict[str, float]:
     """The longest way that one training step moves a number of each parameter."""
     after = list(trainer.model.named_parameters())
     before = [value.detach().clone() for _, value in after]
-    trainer.train_step(random_batch())
+    trainer.train_step(random_batch(), trainer.samples_at(trainer.step))
     return {name: float((value.detach() - was).abs().max()) for (name, value), was in zip(after, before)}
 
 
@@ -197,7 +197,8 @@ def test_codes_and_networks_move_at_their_own_rates(tmp_path):
     moved = changes(make_trainer(tmp_path, lr=1e-2, code_lr=3e-4, warmup=4))
     assert moved.pop("codes") == pytest.approx(3e-4 / 4, rel=1e-3)
     assert max(moved.values()) == pytest.approx(1e-2 / 4, rel=1e-3)
-    assert make_trainer(tmp_path, lr=1e-2, warmup=4).train_step(random_batch())[1] == pytest.approx(1e-2 / 4)  # logged
+    trainer = make_trainer(tmp_path, lr=1e-2, warmup=4)
+    assert trainer.train_step(random_batch(), trainer.samples_at(0))[1] == pytest.approx(1e-2 / 4)  # logged
 
 
 def test_rates_of_pop_are_the_defaults():
@@ -209,7 +210,9 @@ def test_rates_of_pop_are_the_defaults():
 def test_clipping_shortens_the_gradient_before_the_step_and_logs_it_unclipped(tmp_path):
     all_terms = LossConfig(normal_start=0.0)  # every parameter has a gradient
     free, clipped = make_trainer(tmp_path, loss=all_terms), make_trainer(tmp_path, clip=1e-9, loss=all_terms)
-    norms = [float(trainer.train_step(random_batch())[2]) for trainer in (free, clipped)]
+    norms = [
+        float(trainer.train_step(random_batch(), trainer.samples_at(trainer.step))[2]) for trainer in (free, clipped)
+    ]
     assert norms[0] == norms[1] > 1e-3
     gradients = [[value.grad for value in trainer.model.parameters()] for trainer in (free, clipped)]
     assert float(torch.cat([g.flatten() for g in gradients[1]]).norm()) == pytest.approx(1e-9, rel=1e-2)
@@ -222,14 +225,14 @@ def test_late_loss_terms_follow_the_progress_and_count_in_validation(tmp_path, m
     trainer, seen = make_trainer(tmp_path, steps=30), []
     monkeypatch.setattr(loop, "point_avatar_loss", lambda *given: seen.append(given[3]) or point_avatar_loss(*given))
     for trainer.step in (0, 15):
-        trainer.train_step(random_batch())
+        trainer.train_step(random_batch(), trainer.samples_at(trainer.step))
     trainer.validate([random_batch()])
     assert seen == [0, 0.5, 1]
 
 
 def test_validation_asks_the_evaluated_network_and_leaves_it_as_it_was(tmp_path):
     trainer = make_trainer(tmp_path)
-    trainer.train_step(random_batch())
+    trainer.train_step(random_batch(), trainer.samples_at(trainer.step))
     before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
     larger = random_batch()
     batches = [random_batch(2), replace(larger, scan_points=3 * larger.scan_points)]
@@ -244,7 +247,7 @@ def test_validation_asks_the_evaluated_network_and_leaves_it_as_it_was(tmp_path)
         expected["normal"] += share * float(raw["normal"])
     assert {name: values[name] for name in expected} == pytest.approx(expected, rel=1e-5)
     assert trainer.validate(iter(())) == {}
-    trainer.train_step(random_batch())  # goes on as training: running statistics move
+    trainer.train_step(random_batch(), trainer.samples_at(trainer.step))  # goes on as training: running statistics move
     running = [name for name in before if name.endswith("running_mean")]
     assert not any(torch.equal(trainer.model.state_dict()[name], before[name]) for name in running)
 
