@@ -215,6 +215,10 @@ from pathlib import Path
 from avatar.processes import in_workers
 from avatar.training.signals import leave_when_asked
 
+if __name__ != "__main__":
+    Path("importing").touch()
+    time.sleep(1)
+
 def sleep_on(name):
     Path(name).touch()
     time.sleep(1000)
@@ -233,7 +237,8 @@ def test_workers_end_quietly_with_who_started_them(tmp_path, number):
     options = {"cwd": tmp_path, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     process = subprocess.Popen([sys.executable, "script.py"], env=os.environ | {"PYTHONPATH": str(ROOT)}, **options)
     deadline = time.monotonic() + 60
-    while not ((tmp_path / "a").exists() and (tmp_path / "b").exists()):
+    awaited = ["importing"] if number == signal.SIGINT else ["a", "b"]  # a traceback is likeliest amid the imports
+    while not all((tmp_path / name).exists() for name in awaited):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.05)
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
