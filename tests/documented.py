@@ -58,7 +58,11 @@ FILLED = {
 }
 
 # Less work for a verb, nothing else; they replace the values that are printed.
-CANONICALIZER = ("train.first_steps=2", "train.second_steps=2", "train.code_steps=1", "pictures=1", "scan.points=2000")
+CANONICALIZER = (
+    *("train.first_steps=200", "train.second_steps=2", "train.code_steps=1", "train.batch=1"),  # enough for sound scans
+    *("train.draw.scan=256", "train.draw.body=256", "train.draw.edges=64", "train.draw.pool=3000"),
+    *("pictures=1", "scan.edge=0.04"),
+)
 TRAIN = (
     "train.steps=2",
     "train.batch=1",
@@ -97,14 +101,15 @@ FEWER = {
     "closet4": ("method=scale_global,csf,closet_pointnext", "outfit=jacket"),
     "fractions": ("method=static", "split.train_fraction=1.0,0.5"),
     "loose": ("method=closet,closet_learned",),
-    "scanimate1": ("outfit=tee", "canonicalizer.weights=learned,knn"),
-    "scanimate2": ("method=scanimate_global", "split.train_fraction=1.0,0.5"),
+    "scanimate1": ("outfit=tee", "canonicalizer.weights=learned,knn", "canonicalizer.scored=1"),
+    "scanimate2": ("method=scanimate_global", "split.train_fraction=0.5", "canonicalizer.scored=1"),
 }
+LESS = {"scored": "scored=1"}  # in place of a value that is printed
 
 # What a verb promises to leave, with its options filled in.
 PROMISED = {
     "train": ["runs/{method}/{dataset}/{outfit}/{name}/avatar.safetensors"],
-    "fit": ["runs/closet/open/{outfit}/fitted/avatar.safetensors"],
+    "fit": ["runs/closet-fitted/open/{outfit}/fitted/avatar.safetensors"],
     "predict": ["{run}/predictions/{split}/*/*.ply"],
     "evaluate": ["{scored}/scores*.csv"],
     "experiment": ["**/{compare.table}.csv", "**/{compare.table}.md"],
@@ -219,7 +224,7 @@ def shortened(text: str) -> str:
     if text.startswith("torchrun"):  # a whole number of frames a process
         options = [option.replace("train.batch=1", "train.batch=4") for option in options]
     keys = {option.partition("=")[0] for option in options}
-    kept = [word for word in shlex.split(text) if word.partition("=")[0] not in keys]
+    kept = [LESS.get(word.partition("=")[0], word) for word in shlex.split(text) if word.partition("=")[0] not in keys]
     return shlex.join([*kept, *options])
 
 
@@ -249,7 +254,7 @@ def promised_files(text: str) -> list[str]:
 
 
 def run_command(
-    text: str, folder: Path, program: Path, starter: Starter | None = None, timeout: float = 300
+    text: str, folder: Path, program: Path, starter: Starter | None = None, timeout: float = 600
 ) -> Outcome:
     """Runs a command in a folder, with the program elsewhere and no terminal; by a `Starter` it is begun faster."""
     words = shlex.split(text)
