@@ -15,13 +15,13 @@ from avatar.checks import AvatarError
 from avatar.geometry import neighbours
 from avatar.geometry.neighbours import (
     FixedPoints,
-    _build_tree,
     _k_nearest_chunked,
     ball_query,
     k_nearest,
     nearest,
     nearest_both_ways,
 )
+from avatar.geometry.trees import build_tree
 
 
 def cloud(batch: int, count: int, seed: int) -> torch.Tensor:
@@ -142,7 +142,7 @@ def test_fixed_points_are_searched_as_others_and_their_tree_is_built_once(monkey
     points, queries = cloud(1, 60, 0), cloud(3, 40, 1)
     expected = k_nearest(queries, points.expand(3, -1, -1), 4)
     built = []
-    monkeypatch.setattr(neighbours, "_build_tree", lambda *given: built.append(1) or _build_tree(*given))
+    monkeypatch.setattr(neighbours, "build_tree", lambda *given: built.append(1) or build_tree(*given))
     fixed = FixedPoints(points[0])
     for _ in range(3):
         assert torch.equal(fixed.k_nearest(queries.to(device), 4).cpu(), expected)

@@ -73,8 +73,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path, monkeyp
 
 def test_the_tree_over_the_body_at_rest_is_built_once(tmp_path, monkeypatch):
     built = []
-    build = neighbours._build_tree
-    monkeypatch.setattr(neighbours, "_build_tree", lambda cloud: built.append(len(cloud)) or build(cloud))
+    build = neighbours.build_tree
+    monkeypatch.setattr(neighbours, "build_tree", lambda cloud: built.append(len(cloud)) or build(cloud))
     trainer = make_trainer(tmp_path)
     trainer.fit()
     assert built == [len(TEMPLATE.vertices)]
