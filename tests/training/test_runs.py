@@ -105,7 +105,7 @@ def test_point_counts_and_outfits_out_of_range_are_refused(settings, tiny_outfit
         template_samples(tiny_outfit.template, 10)
     with pytest.raises(AvatarError, match="400,000"):
         template_samples(tiny_outfit.template, 400_001)
-    with pytest.raises(DataError, match=r"no such outfit.*Did you mean tiny"):
+    with pytest.raises(DataError, match=r"no such outfit.*Did you mean 'tiny'"):
         train_run(replace(settings, outfit=("tinny",)))
     with pytest.raises(AvatarError, match="different outfits"):
         replace(settings, outfit=("tiny", "tiny"))
