@@ -341,7 +341,7 @@ def test_outfits_are_found_by_name(tiny_folder):
     assert isinstance(outfit, OpenOutfit)
     assert (outfit.dataset, outfit.name) == ("open", "tiny")
     assert len(outfit.load("train", "rise.00000").scan.points) == 300
-    with pytest.raises(DataError, match=r"no such outfit\. Did you mean tiny\? There are: tiny"):
+    with pytest.raises(DataError, match=r"no such outfit\. Did you mean 'tiny'\? There are: tiny"):
         find_outfit(root, "open", "tinny")
     with pytest.raises(DataError, match="expected the folder of data set cape"):
         find_outfit(root, "cape", "tiny")

@@ -202,7 +202,7 @@ def test_point_counts_and_outfits_out_of_range_are_refused(settings, tiny_outfit
         template_samples(tiny_outfit.template, 10)
     with pytest.raises(AvatarError, match="400,000"):
         template_samples(tiny_outfit.template, 400_001)
-    with pytest.raises(DataError, match=r"no such outfit.*Did you mean tiny"):
+    with pytest.raises(DataError, match=r"no such outfit.*Did you mean 'tiny'"):
         train_run(replace(settings, outfit=("tinny",)))
     avatar = TrainedAvatar(torch.nn.Identity(), tiny_outfit.template, replace(settings, outfit=("tee", "tiny")), 0, 0.0)
     assert [outfit_index(avatar, name) for name in ("tee", "tiny")] == [0, 1]
