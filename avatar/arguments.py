@@ -23,8 +23,12 @@ from avatar.io.documents import check_events, read_yaml
 PLUGINS = ("joblib", "submitit_slurm", "submitit_local")  # launchers of the extra `cluster`
 
 
-def tidy_arguments(arguments: list[str]) -> list[str]:
+def tidy_arguments(arguments: list[str], sweeps: bool = False) -> list[str]:
     """Arguments as Hydra takes them: its flags first, and lists that a shell split at a blank joined again.
+
+    Args:
+        arguments: those of the command line.
+        sweeps: whether the verb is a multirun without being asked for one.
 
     Raises:
         AvatarError: for flags there are not and words that are no option, with the form to write instead.
@@ -45,7 +49,7 @@ def tidy_arguments(arguments: list[str]) -> list[str]:
     for word in known.overrides:
         flags.remove(word)
     options = list(_joined(known.overrides))
-    several = known.multirun
+    several = known.multirun or sweeps
     for option in options:
         _check_option(option, several)
     return [*flags, *options]

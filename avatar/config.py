@@ -100,7 +100,7 @@ def command(verb: str, run: Callable[[Any], Any] | None = None) -> None:
         listen_to_verbs(logging.INFO if team.leads else logging.WARNING)
         try:
             register(verb)
-            sys.argv[1:] = tidy_arguments(sys.argv[1:])
+            sys.argv[1:] = tidy_arguments(sys.argv[1:], sweeps=bool(VERBS[verb].then))
             refuse_code(sys.argv[1:])
             main()
         except SystemExit as leaving:

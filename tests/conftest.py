@@ -1,5 +1,6 @@
 """Its place puts this folder on the path, so that tests import the slow truths as ``reference``."""
 
+import os
 import shutil
 
 import pretended
@@ -12,11 +13,22 @@ from avatar.data.open_layout import OpenOutfit
 from avatar.data.scanner import ScanConfig
 from avatar.io import ledger
 
-pretended.install()  # before any backward pass: torch counts its devices once, at the first
+ON_PRETENDED = "AVATAR_PRETENDED" in os.environ  # set by tests/test_pretended.py
+if ON_PRETENDED:
+    pretended.install()  # before any backward pass: torch counts its devices once, at the first
 CHROMIUM_FLAGS = (
     "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync "
     "--disable-quic --no-first-run"
 )
+
+
+def pytest_collection_modifyitems(items):
+    """Tests on the pretended accelerator run in a process of their own, and nothing else runs there.
+
+    With a device, torch keeps threads for backward passes, and a forked process (the reliability tests fork) may then
+    run none.
+    """
+    items[:] = [item for item in items if bool(item.get_closest_marker("pretended")) == ON_PRETENDED]
 
 
 @pytest.fixture(scope="session")

@@ -34,6 +34,7 @@ from avatar.training.fitting import FitConfig, fit_outfit
 from avatar.training.prediction import garment_template_cloud
 from avatar.training.runs import MethodChoice, RunConfig, Space
 
+pytestmark = pytest.mark.pretended
 UNET = {"levels": 3, "width": 4, "out_channels": 4}
 POP = {
     "pose_encoder": UNET,

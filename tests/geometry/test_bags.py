@@ -67,7 +67,7 @@ def test_values_of_another_number_of_rows_are_refused():
         sum_bags(torch.zeros(11, 3), Bags.of_table(TABLE, 12))
 
 
-@pytest.mark.parametrize("device", ["cpu", pretended.NAME])
+@pytest.mark.parametrize("device", ["cpu", pytest.param(pretended.NAME, marks=pytest.mark.pretended)])
 def test_picked_rows_and_their_gradients_agree_with_the_loop(device):
     ids = torch.randint(0, 5, (2, 40), generator=SOURCE)  # of 7 rows: many more than once, two never
     values = torch.randn(2, 7, 3, dtype=torch.float64, generator=SOURCE)
@@ -88,7 +88,7 @@ def test_picked_rows_and_their_gradients_agree_with_the_loop(device):
     torch.testing.assert_close(found.cpu(), torch.stack([back[0], 0 * back[1]]))
 
 
-@pytest.mark.parametrize("device", ["cpu", pretended.NAME])
+@pytest.mark.parametrize("device", ["cpu", pytest.param(pretended.NAME, marks=pytest.mark.pretended)])
 def test_picking_and_its_backward_pass_are_repeatable(device):
     """No operation that torch knows to add in an order of chance, on the CPU or on a device."""
     torch.use_deterministic_algorithms(True)

@@ -137,7 +137,7 @@ def test_full_size_search_is_fast():
     assert time.process_time() - start < 1.0
 
 
-@pytest.mark.parametrize("device", ["cpu", pretended.NAME])
+@pytest.mark.parametrize("device", ["cpu", pytest.param(pretended.NAME, marks=pytest.mark.pretended)])
 def test_fixed_points_are_searched_as_others_and_their_tree_is_built_once(monkeypatch, device):
     points, queries = cloud(1, 60, 0), cloud(3, 40, 1)
     expected = k_nearest(queries, points.expand(3, -1, -1), 4)
@@ -151,6 +151,7 @@ def test_fixed_points_are_searched_as_others_and_their_tree_is_built_once(monkey
         fixed.k_nearest(queries, 61)
 
 
+@pytest.mark.pretended
 @pytest.mark.parametrize("search", [k_nearest, nearest_both_ways])
 def test_a_device_searches_by_itself(search):
     points, queries = cloud(2, 50, 0), cloud(2, 40, 1)

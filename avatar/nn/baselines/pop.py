@@ -127,7 +127,7 @@ class PopAvatar(nn.Module):
             pose = self.atlas.look_up_at(samples)(image)
             parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1), places))
         parts = [Decoded(part.offsets.float() * self.config.offset_scale, part.normals.float()) for part in parts]
-        local = sum(parts, bare_body(self.skin_normals, samples, self.config.normals))
+        local = sum(parts, bare_body(self.skin_normals.float(), samples, self.config.normals))
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
             linear = interpolate(batch.vertex_transforms[..., :3, :3].flatten(-2), samples).unflatten(-1, (3, 3))
             points = interpolate(batch.vertices, samples) + transform_directions(linear, local.offsets)
