@@ -56,8 +56,9 @@ def count(monkeypatch):
 
 
 def spoil(path: Path) -> bytes:
+    """Flips the lowest bit of a file's last number, which stays one of its kind; gives what the file was."""
     data = path.read_bytes()
-    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    path.write_bytes(data[:-4] + bytes([data[-4] ^ 1]) + data[-3:])
     return data
 
 

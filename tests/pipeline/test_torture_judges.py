@@ -128,8 +128,8 @@ def test_a_trial_without_poison_and_a_step_that_spoils_moments_are_found_out(roo
     else:
         step = loop.Trainer.train_step
 
-        def spoiling(trainer, batch):
-            result = step(trainer, batch)
+        def spoiling(trainer, *inputs):
+            result = step(trainer, *inputs)
             if trainer.bad_steps:
                 next(iter(trainer.optimiser.state.values()))["exp_avg"] += 1
             return result
