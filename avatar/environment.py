@@ -18,7 +18,6 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import avatar
-from avatar.checks import AvatarError
 from avatar.invocation import CORE, DISTRIBUTIONS, install_line
 
 if TYPE_CHECKING:
@@ -110,6 +109,8 @@ def choose_device(name: str) -> torch.device:
         AvatarError: for a device that there is not.
     """
     import torch
+
+    from avatar.checks import AvatarError
 
     name = accelerator_type() if name == "auto" else name
     try:

@@ -92,17 +92,16 @@ def make_motion() -> None:
     make_motion walk walk.npz
     make_motion dance data/motions/dance.npz --seconds 10 --fps 60
     """
+    from avatar.checks import AvatarError
+    from avatar.io.motions import write_motion
+    from avatar.simulate.sequences import authored_motion
+
     parser = parser_of(make_motion)
     parser.add_argument("name", help="walk, squat, twist, reach, kick, bend or dance")
     parser.add_argument("target", type=Path, help="the .npz to write")
     parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--fps", type=float, default=30.0)
     options = parser.parse_args()
-
-    from avatar.checks import AvatarError
-    from avatar.io.motions import write_motion
-    from avatar.simulate.sequences import authored_motion
-
     try:
         motion = authored_motion(options.name, options.fps, options.seconds)
         write_motion(options.target, motion)
@@ -117,15 +116,14 @@ def pack() -> None:
     pack data/open/tee data/packed/tee
     pack avatar/assets/sample/dress data/packed/dress
     """
-    parser = parser_of(pack)
-    parser.add_argument("source", type=Path, help="the outfit's folder")
-    parser.add_argument("target", type=Path, help="the folder to write")
-    paths = parser.parse_args()
-
     from avatar.checks import AvatarError
     from avatar.data.layouts import open_outfit_folder
     from avatar.data.packed_layout import write_packed_outfit
 
+    parser = parser_of(pack)
+    parser.add_argument("source", type=Path, help="the outfit's folder")
+    parser.add_argument("target", type=Path, help="the folder to write")
+    paths = parser.parse_args()
     try:
         packed = write_packed_outfit(open_outfit_folder(paths.source), paths.target)
     except AvatarError as error:

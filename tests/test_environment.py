@@ -11,7 +11,7 @@ import pytest
 
 from avatar.environment import inspect_package, mending_line
 from avatar.invocation import interpreter
-from avatar.pipeline.torture.miniature import prepare, weights_digest
+from avatar.pipeline.torture.miniature import weights_digest, write_data
 from avatar.training.canonicalizing import canonicalize_frames, train_canonicalizer
 from avatar.training.fitting import fit_outfit
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
@@ -159,16 +159,22 @@ def test_all_that_verbs_and_callers_of_the_package_start_prepares_the_process():
 
 @pytest.mark.slow
 def test_a_run_from_python_has_the_bits_of_the_command_s(tmp_path):
-    """Training whose numbers fall below 1e-38, in two threads, after other work with torch."""
-    prepare(tmp_path)
-    small = ["sdf.widths=[16,16,16]", "sdf.skip=1", "sdf.orders=2", "gate_spacing=0.1"]
-    line = [sys.executable, str(ROOT / "tools" / "train.py"), "method=scanimate", "dataset=open", "outfit=tee"]
-    line += [f"data_root={tmp_path / 'data'}", f"runs_root={tmp_path / 'runs'}", "canonical=nearest", "device=cpu"]
-    line += ["train.steps=6", "train.batch=2", "train.scan_points=300", "scan.points=1000", "name=command"]
-    line += [f"method.settings.avatar.{option}" for option in small]
+    """Codes that start at zero and move by 1e-39 a step, in two threads, after other work with torch."""
+    write_data(tmp_path)
+    line = [
+        sys.executable,
+        str(ROOT / "tools" / "train.py"),
+        "dataset=open",
+        "outfit=tee",
+        "name=command",
+        "size=small",
+    ]
+    line += [f"data_root={tmp_path / 'data'}", f"runs_root={tmp_path / 'runs'}", "device=cpu", "name=command"]
+    line += ["scan.points=1000", "train.steps=2", "train.batch=1", "train.points=300", "train.scan_points=300"]
+    line += ["train.code_lr=1e-39", "method.settings.code_std=0"]
     done = subprocess.run(line, cwd=tmp_path, env=os.environ | TWO_THREADS, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    folder = tmp_path / "runs" / "scanimate" / "open" / "tee" / "command"
+    folder = tmp_path / "runs" / "closet" / "open" / "tee" / "command"
     code = (
         "import sys, torch\n"
         "torch.ones(1 << 20).exp().sum()  # two OpenMP threads are there before the package is\n"
@@ -176,10 +182,9 @@ def test_a_run_from_python_has_the_bits_of_the_command_s(tmp_path):
         "from pathlib import Path\n"
         "from avatar.io.documents import read_yaml\n"
         "from avatar.settings import settings_from_dict\n"
-        "from avatar.training.implicit_runs import train_implicit\n"
-        "from avatar.training.runs import RunConfig\n"
+        "from avatar.training.runs import RunConfig, train_run\n"
         "config = settings_from_dict(RunConfig, read_yaml(Path(sys.argv[1]) / 'config.yaml'))\n"
-        "train_implicit(replace(config, name='python'))"
+        "train_run(replace(config, name='python'))"
     )
     in_fresh_python(code, str(folder), **TWO_THREADS)
     assert weights_digest(folder) == weights_digest(folder.with_name("python")) != ""
