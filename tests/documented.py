@@ -113,7 +113,7 @@ PROMISED = {
     "predict": ["{run}/predictions/{split}/*/*.ply"],
     "evaluate": ["{scored}/scores*.csv"],
     "experiment": ["**/{compare.table}.csv", "**/{compare.table}.md"],
-    "compare": ["**/{table}.csv", "**/{table}.md"],
+    "compare": ["**/{table}*.csv", "**/{table}.md"],
     "seams": ["**/seams.csv", "**/seams.md"],
     "mesh": ["{run}/meshes/{split}/*/*.ply", "{run}/meshes/{split}/*/*.obj", "{run}/meshes/{split}/*/*.glb"],
     "export": [f"{{run}}/export/{{predictions}}/*/{name}" for name in ("points.usdc", "body.glb", "preview.webp")],
