@@ -55,6 +55,7 @@ FILLED = {
     "<table>": ["closet5"],
     "run=...": [f"run={folder}" for folder in TABLE],
     ",...]": ["]"],
+    "out=/tmp": ["out=elsewhere"],
 }
 
 # Less work for a verb, nothing else; they replace the values that are printed.
