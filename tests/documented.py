@@ -129,7 +129,7 @@ PROMISED = {
     "make_body": ["{0}"],
     "doctor": [],
 }
-USUAL = {"dataset": "sample", "outfit": "dress", "name": "default", "method": "closet", "split": "test"}
+USUAL = {"dataset": "sample", "outfit": "dress", "name": "default", "method": "closet", "split": "test", "table": "main"}
 
 
 @dataclass(frozen=True)
