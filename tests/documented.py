@@ -55,6 +55,7 @@ FILLED = {
     "<table>": ["closet5"],
     "run=...": [f"run={folder}" for folder in TABLE],
     ",...]": ["]"],
+    "out=/tmp": ["out=elsewhere"],
 }
 
 # Less work for a verb, nothing else; they replace the values that are printed.
@@ -113,7 +114,7 @@ PROMISED = {
     "predict": ["{run}/predictions/{split}/*/*.ply"],
     "evaluate": ["{scored}/scores*.csv"],
     "experiment": ["**/{compare.table}.csv", "**/{compare.table}.md"],
-    "compare": ["**/{table}.csv", "**/{table}.md"],
+    "compare": ["**/{table}*.csv", "**/{table}.md"],
     "seams": ["**/seams.csv", "**/seams.md"],
     "mesh": ["{run}/meshes/{split}/*/*.ply", "{run}/meshes/{split}/*/*.obj", "{run}/meshes/{split}/*/*.glb"],
     "export": [f"{{run}}/export/{{predictions}}/*/{name}" for name in ("points.usdc", "body.glb", "preview.webp")],
@@ -128,7 +129,7 @@ PROMISED = {
     "make_body": ["{0}"],
     "doctor": [],
 }
-USUAL = {"dataset": "sample", "outfit": "dress", "name": "default", "method": "closet", "split": "test"}
+USUAL = {"dataset": "sample", "outfit": "dress", "name": "default", "method": "closet", "split": "test", "table": "main"}
 
 
 @dataclass(frozen=True)

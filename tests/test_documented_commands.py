@@ -48,8 +48,13 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         "python tools/predict.py run=runs/static/sample/dress/default",
         "python tools/evaluate.py runs=[runs/static/sample/dress/default,runs/closet/sample/dress/default]",
         f"python tools/predict.py run={FIRST} motion=walk.npz",
+        "python tools/train.py outfit=dress method=pop",
     ),
-    ("python tools/experiment.py experiment=closet5", "python tools/train.py dataset=open outfit=[tee,shirt]"),
+    (
+        "python tools/experiment.py experiment=closet5",
+        "python tools/train.py dataset=open outfit=[tee,shirt]",
+        "python tools/demo.py",
+    ),
 )
 SLOW = {"experiment": 25, "bench": 20, "torture": 10, "demo": 25, "doctor": 30}  # seconds; 6 for other verbs
 PRINTED = printed_commands()
