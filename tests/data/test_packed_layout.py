@@ -1,10 +1,9 @@
 """Packed outfits of one's own body: what ``outfit.yaml`` may say, poses with and without hands, mean shapes."""
 
 import dataclasses
-import runpy
+import re
 import shutil
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +19,9 @@ from avatar.checks import DataError
 from avatar.data.layouts import open_outfit_folder
 from avatar.data.open_layout import OpenOutfit
 from avatar.data.packed_layout import PackedOutfit
+from avatar.plain_verbs import pack
 
 POSE = tiny_pose(0.5)
-TOOLS = Path(__file__).parents[2] / "tools"
 
 
 @pytest.fixture
@@ -118,9 +117,9 @@ def test_the_pack_command_keeps_the_canonical_pose(tiny_folder, tmp_path, monkey
     text = (tmp_path / "open" / "tiny" / "outfit.yaml").read_text()
     (tmp_path / "open" / "tiny" / "outfit.yaml").write_text(text.replace("canonical: t", "canonical: apart"))
     outfit = OpenOutfit(tmp_path / "open" / "tiny")
-    monkeypatch.setattr(sys, "argv", ["pack.py", str(outfit.path), str(tmp_path / "packed" / "tiny")])
-    runpy.run_path(str(TOOLS / "pack.py"), run_name="__main__")
-    assert "1 frames. Train on them: python tools/train.py dataset=packed outfit=tiny" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["pack", str(outfit.path), str(tmp_path / "packed" / "tiny")])
+    pack()
+    assert re.search(r"1 frames\nnext: .*train\.py dataset=packed outfit=tiny data_root=", capsys.readouterr().out)
     packed = PackedOutfit(tmp_path / "packed" / "tiny")
     apart = canonical_pose("apart", outfit.body.joint_names)
     torch.testing.assert_close(packed.body.canonical_pose, apart)

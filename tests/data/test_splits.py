@@ -52,7 +52,9 @@ def test_frames_in_train_and_test_are_refused(tiny_outfit):
     assert len(split.train + split.validation) == 6
     with pytest.raises(AvatarError, match=r"tiny: .* 1 are in both \(b\)"):
         check_leakage(["a", "b"], ["b", "c"], "tiny")
-    leaking = SimpleNamespace(name="x", path=tiny_outfit.path, frames=lambda split: ("a.1", "a.2"))
+    leaking = SimpleNamespace(
+        name="x", path=tiny_outfit.path, frames=lambda _: ("a.1", "a.2"), has_frames=lambda _: True
+    )
     with pytest.raises(AvatarError, match="2 are in both"):
         split_outfit(leaking)
 

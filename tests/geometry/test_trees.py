@@ -12,11 +12,12 @@ from avatar.geometry.trees import build_tree
 CLOUDS = """
 import sys
 import numpy as np
-from avatar.environment import prepare_process
+from avatar.environment import prepared_process
 from avatar.evaluation.closest import closest_on_mesh
 from avatar.geometry.trees import build_tree
 
-prepare_process()
+prepared = prepared_process()
+prepared.__enter__()
 rng = np.random.default_rng(0)
 clouds = {"issue": np.stack([np.r_[np.zeros(60), np.linspace(0.1, 1, 40)], np.zeros(100), np.zeros(100)], axis=1)}
 clouds["one place"] = np.zeros((500, 3))
