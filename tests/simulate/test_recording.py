@@ -52,11 +52,15 @@ def test_presets_are_as_promised():
     assert not set(PRESETS["motion"].train_motions) & set(PRESETS["motion"].test_motions)
 
 
-def test_folders_tell_bodies_apart():
+def test_folders_tell_bodies_apart(tmp_path):
     both = dressed_outfits(SimulateConfig(outfits=["dress"], shapes=["female", "male"]))
     assert [(folder, clothes.shape) for folder, clothes in both] == [("dress", "female"), ("dress_male", "male")]
-    made = dressed_outfits(SimulateConfig(outfits=["dress"], shapes=["bodies/tall.npz"]))
-    assert [(folder, clothes.shape) for folder, clothes in made] == [("dress_tall", "bodies/tall.npz")]
+    tall = tmp_path / "tall.npz"
+    write_body(tall, open_body("male"))
+    made = dressed_outfits(SimulateConfig(outfits=["dress"], shapes=[str(tall)]))
+    assert [(folder, clothes.shape) for folder, clothes in made] == [("dress_tall", str(tall))]
+    with pytest.raises(AvatarError, match=r"shapes: .*none\.npz: expected a file of tools/make_body\.py"):
+        SimulateConfig(shapes=[str(tmp_path / "none.npz")])
 
 
 def test_bodies_from_files_are_of_the_open_topology(tmp_path):
