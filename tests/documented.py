@@ -129,7 +129,14 @@ PROMISED = {
     "make_body": ["{0}"],
     "doctor": [],
 }
-USUAL = {"dataset": "sample", "outfit": "dress", "name": "default", "method": "closet", "split": "test", "table": "main"}
+USUAL = {
+    "dataset": "sample",
+    "outfit": "dress",
+    "name": "default",
+    "method": "closet",
+    "split": "test",
+    "table": "main",
+}
 
 
 @dataclass(frozen=True)
