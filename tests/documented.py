@@ -229,8 +229,8 @@ def shortened(text: str) -> str:
     """A command with the options of its verb that make less work, in place of those printed."""
     named = re.search(r" experiment=(\w+)", text)
     options = [*SHORT.get(verb_of(text), ()), *FEWER.get(named.group(1) if named else "", ())]
-    if text.startswith("torchrun"):  # a whole number of frames a process
-        options = [option.replace("train.batch=1", "train.batch=4") for option in options]
+    if text.startswith("torchrun"):  # a whole number of frames a process, and so another run than that of one process
+        options = [*(option for option in options if option != "train.batch=1"), "train.batch=4", "name=team"]
     keys = {option.partition("=")[0] for option in options}
     kept = [LESS.get(word.partition("=")[0], word) for word in shlex.split(text) if word.partition("=")[0] not in keys]
     return shlex.join([*kept, *options])
