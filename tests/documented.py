@@ -321,6 +321,7 @@ def copy_program(folder: Path) -> Path:
     """A copy of the program whose embedded sample has six train and two test frames an outfit."""
     for name in ("avatar", "conf", "tools"):
         shutil.copytree(ROOT / name, folder / name)
+    shutil.copy2(ROOT / "setup.cfg", folder)  # by which a checkout is known
     for outfit in (folder / "avatar/assets/sample").iterdir():
         for split, count in (("train", 6), ("test", 2)):
             paths = sorted((outfit / split).glob("*.npz"))
