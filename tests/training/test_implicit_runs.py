@@ -200,7 +200,7 @@ def test_validation_is_a_mean_over_frames_at_the_same_points_in_any_mode(make_tr
     trainer.model.train()
     assert trainer.validate(held_back.ordered()) == values
     batch = held_back.batch_at(0, 2)
-    losses = [float(trainer.losses(batch, key).total.detach()) for key in (0, 0, 1)]
+    losses = [float(trainer.losses(batch, trainer.space_at(batch, key)).total.detach()) for key in (0, 0, 1)]
     assert losses[0] == losses[1] != losses[2]  # points in space follow from the step
 
 
