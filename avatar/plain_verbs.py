@@ -114,7 +114,6 @@ def pack() -> None:
     """Writes an outfit of any layout as packed frames, which the programs of the POP line read as well (docs/data.md).
 
     pack data/open/tee data/packed/tee
-    pack avatar/assets/sample/dress data/packed/dress
     """
     from avatar.checks import AvatarError
     from avatar.data.layouts import open_outfit_folder

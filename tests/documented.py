@@ -127,6 +127,8 @@ PROMISED = {
     "parameters": ["**/parameters.csv", "**/parameters.md"],
     "convert_body": ["{1}"],
     "make_body": ["{0}"],
+    "make_motion": ["{1}"],
+    "pack": ["{1}/train/*.npz"],
     "doctor": [],
 }
 USUAL = {

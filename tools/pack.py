@@ -1,7 +1,6 @@
 """Writes an outfit of any layout as packed frames, which the programs of the POP line read as well (docs/data.md).
 
 python tools/pack.py data/open/tee data/packed/tee
-python tools/pack.py avatar/assets/sample/dress data/packed/dress
 """
 
 from start import run
