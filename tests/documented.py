@@ -102,6 +102,7 @@ FEWER = {
     "closet4": ("method=scale_global,csf,closet_pointnext", "outfit=jacket"),
     "fractions": ("method=static", "split.train_fraction=1.0,0.5"),
     "loose": ("method=closet,closet_learned",),
+    "normals": ("outfit=tee", "method=pop", "train.seed=0"),
     "scanimate1": ("outfit=tee", "canonicalizer.weights=learned,knn", "canonicalizer.scored=1"),
     "scanimate2": ("method=scanimate_global", "split.train_fraction=0.5", "canonicalizer.scored=1"),
 }
