@@ -43,7 +43,7 @@ def convert_body() -> None:
 
     convert_body SMPLX_NEUTRAL.npz data/bodies/smplx_neutral.npz
     convert_body SMPL_NEUTRAL.pkl data/bodies/smpl_neutral.npz --uv smpl_uv.obj
-    convert_body data/mine/coat/template.npz with_uv.npz --uv body.obj
+    convert_body data/theirs/coat/template.npz with_uv.npz --uv body.obj
     """
     parser = parser_of(convert_body)
     parser.add_argument("source", type=Path, help="the downloaded model, .npz or .pkl")

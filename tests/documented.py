@@ -22,6 +22,8 @@ import torch
 from bodies import distinct, random_bind, random_model, write_unwrapped
 
 from avatar.body.packed import write_template
+from avatar.data.layouts import open_outfit_folder
+from avatar.data.packed_layout import write_packed_outfit
 from avatar.io.frames import write_manifest
 from avatar.io.motions import write_motion
 from avatar.simulate.sequences import authored_motion
@@ -344,7 +346,8 @@ def prepare_workspace(folder: Path, program: Path) -> Path:
     np.savez(folder / "SMPLX_NEUTRAL.npz", **model)
     (folder / "SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps(distinct(vars(random_model("smpl")))))
     template = replace(random_bind(), faces=torch.from_numpy(model["f"].astype(np.int64)))
-    write_template(folder / "data/mine/coat/template.npz", template)
+    write_template(folder / "data/theirs/coat/template.npz", template)
+    write_packed_outfit(open_outfit_folder(folder / "data/open/dress"), folder / "data/mine/coat")
     for name in ("body.obj", "smpl_uv.obj"):
         write_unwrapped(folder / name, model, places)
     return folder

@@ -2,7 +2,7 @@
 
 python tools/convert_body.py SMPLX_NEUTRAL.npz data/bodies/smplx_neutral.npz
 python tools/convert_body.py SMPL_NEUTRAL.pkl data/bodies/smpl_neutral.npz --uv smpl_uv.obj
-python tools/convert_body.py data/mine/coat/template.npz with_uv.npz --uv body.obj
+python tools/convert_body.py data/theirs/coat/template.npz with_uv.npz --uv body.obj
 """
 
 from start import run
