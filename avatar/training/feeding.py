@@ -15,36 +15,39 @@ Records = tuple[Any, ...]  # dataclasses of tensors
 
 
 class Feed:
-    """The inputs of training steps on a device: while a step trains, a thread prepares those of the next one.
+    """The inputs of training steps on a device: while a step trains there, a thread prepares those of the next one.
 
     They are the same as without it, for they follow from the step alone. Used as a ``with`` block, at whose end,
     whatever ends it, nothing goes on in the background. For CUDA they are copied from pinned memory, beside the work
-    of the step before.
+    of the step before. On the CPU they are prepared when they are asked for: a thread with work of its own would have
+    OpenMP threads of its own, and OpenMP then lets all of them sleep at once (docs/performance.md).
     """
 
     def __init__(self, make: Callable[[int], Records], steps: int, device: torch.device):
         """Prepares nothing yet.
 
         Args:
-            make: the inputs of a step; called in another thread, by one call at a time, and never for two steps past
-                the one at hand.
+            make: the inputs of a step; called by one call at a time, and never for two steps past the one at hand.
             steps: how many there are; none is prepared beyond.
             device: where they go.
         """
         self.make, self.steps, self.device = make, steps, device
         self.pinned = device.type == "cuda"
         options = {"initializer": torch.cuda.set_device, "initargs": (device,)} if self.pinned else {}
-        self.thread = ThreadPoolExecutor(1, "feed", **options)
+        self.thread = ThreadPoolExecutor(1, "feed", **options) if device.type != "cpu" else None
         self.ahead: dict[int, Future[Records]] = {}
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.thread.shutdown(cancel_futures=True)
+        if self.thread:
+            self.thread.shutdown(cancel_futures=True)
 
     def __call__(self, step: int) -> Records:
         """The inputs of a step, on the device. What `make` raises for a step is raised here, at that step."""
+        if not self.thread:
+            return to_device(self.make(step), self.device)
         ready = self.ahead.pop(step, None) or self.thread.submit(self._prepare, step)
         records = ready.result()
         self.ahead = {step + 1: self.thread.submit(self._prepare, step + 1)} if step + 1 < self.steps else {}

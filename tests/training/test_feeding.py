@@ -8,7 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from avatar.training import feeding
 from avatar.training.feeding import Feed
+
+CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -22,21 +25,36 @@ def numbers(step: int) -> tuple[Numbers, Numbers]:
     return Numbers(torch.rand(3, generator=draw), f"step {step}"), Numbers(torch.full((1,), step), "number")
 
 
+@pytest.fixture
+def elsewhere(monkeypatch) -> torch.device:
+    """A device that is not the CPU, whose tensors stay where they are."""
+    monkeypatch.setattr(feeding, "to_device", lambda records, device: records)
+    return torch.device("meta")
+
+
 def feeding_threads() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name.startswith("feed")]
 
 
-def test_inputs_are_those_of_their_step_wherever_one_begins():
-    for first in (0, 4):
-        with Feed(numbers, 8, torch.device("cpu")) as feed:
+def test_inputs_are_those_of_their_step_wherever_one_begins(elsewhere):
+    for first, device in ((0, CPU), (0, elsewhere), (4, elsewhere)):
+        with Feed(numbers, 8, device) as feed:
             for step in range(first, 8):
                 for mine, expected in zip(feed(step), numbers(step), strict=True):
                     assert torch.equal(mine.values, expected.values) and mine.name == expected.name
-    with Feed(numbers, 8, torch.device("cpu")) as feed:  # and where one jumps
+    with Feed(numbers, 8, elsewhere) as feed:  # and where one jumps
         assert [feed(step)[1].values.item() for step in (3, 3, 0, 7)] == [3, 3, 0, 7]
 
 
-def test_the_next_step_is_made_while_this_one_trains_and_none_beyond_the_last():
+def test_on_the_cpu_no_thread_is_begun():
+    """A second thread with tensor work halves the patience of OpenMP's idle threads, and with it the speed of steps."""
+    seen = []
+    with Feed(lambda step: seen.append(threading.current_thread()) or numbers(step), 2, CPU) as feed:
+        feed(0)
+    assert seen == [threading.main_thread()]
+
+
+def test_the_next_step_is_made_while_this_one_trains_and_none_beyond_the_last(elsewhere):
     made, second = [], threading.Event()
 
     def make(step: int):
@@ -46,25 +64,25 @@ def test_the_next_step_is_made_while_this_one_trains_and_none_beyond_the_last():
             second.set()
         return numbers(step)
 
-    with Feed(make, 2, torch.device("cpu")) as feed:
+    with Feed(make, 2, elsewhere) as feed:
         feed(0)
         assert second.wait(10)  # without being asked for
         feed(1)
     assert made == [0, 1]
 
 
-def test_an_error_is_raised_at_its_own_step_and_ends_the_thread():
+def test_an_error_is_raised_at_its_own_step_and_ends_the_thread(elsewhere):
     def make(step: int):
         return numbers(step) if step != 2 else 1 // 0
 
-    with pytest.raises(ZeroDivisionError), Feed(make, 5, torch.device("cpu")) as feed:
+    with pytest.raises(ZeroDivisionError), Feed(make, 5, elsewhere) as feed:
         assert feed(0) and feed(1)
         feed(2)
     assert not feeding_threads()
 
 
 @pytest.mark.parametrize("ending", [KeyboardInterrupt, SystemExit, None])
-def test_whatever_ends_the_steps_nothing_goes_on(ending):
+def test_whatever_ends_the_steps_nothing_goes_on(ending, elsewhere):
     running = []
 
     def make(step: int):
@@ -74,7 +92,7 @@ def test_whatever_ends_the_steps_nothing_goes_on(ending):
         return numbers(step)
 
     def work():
-        with Feed(make, 100, torch.device("cpu")) as feed:
+        with Feed(make, 100, elsewhere) as feed:
             feed(0)
             if ending:
                 raise ending
