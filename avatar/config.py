@@ -37,12 +37,12 @@ from avatar.pipeline.endings import report_ending
 from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
 from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.training.distributed import current_team, torchrun_team
 from avatar.training.signals import Stopped, leave_when_asked
 from avatar.verbs import VERBS, resolve
+from avatar.world import current_world, torchrun_world
 
 CONF = (checkout() or PACKAGE) / "conf"  # a wheel has it in the package
-METHOD_SETTINGS = "avatar.pipeline.methods:SETTINGS"
+METHOD_SETTINGS = "avatar.methods.registry:SETTINGS"
 Settings = TypeVar("Settings")
 report = logging.getLogger(__name__)
 
@@ -96,8 +96,8 @@ def command(verb: str, run: Callable[[Any], Any] | None = None) -> None:
         run_job(verb, run, config, journal, parent)
 
     code = 0
-    with torchrun_team() as team, leave_when_asked(lambda number: ask_to_stop(journal, number)):
-        listen_to_verbs(logging.INFO if team.leads else logging.WARNING)
+    with torchrun_world() as world, leave_when_asked(lambda number: ask_to_stop(journal, number)):
+        listen_to_verbs(logging.INFO if world.is_main else logging.WARNING)
         try:
             register(verb)
             sys.argv[1:] = tidy_arguments(sys.argv[1:], sweeps=bool(VERBS[verb].then))
@@ -153,7 +153,7 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
 
     if several and is_stopping(journal):
         return end(State.stopped, "not begun.", STOPPED)
-    if several and current_team().size > 1:
+    if several and current_world().size > 1:
         return end(State.failed, "torchrun trains one run; leave out either it or --multirun.", 2)
     if several:
         note_outcome(journal, job.job.num, name, State.running)
@@ -164,7 +164,7 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
             started = time.monotonic()
             result = run(settings)
             report_ending(verb, settings, result, time.monotonic() - started)
-            if VERBS[verb].then and not several and current_team().leads:
+            if VERBS[verb].then and not several and current_world().is_main:
                 report.info("%s: %s", verb, resolve(VERBS[verb].then)([settings]))
     except Stopped as stopped:
         return end(State.stopped, str(stopped), STOPPED)

@@ -233,6 +233,18 @@ class Mesh:
 
 
 @dataclass(frozen=True)
+class Surface:
+    """The dressed surface of one body: oriented points and, where the method has one, a mesh.
+
+    ``constant`` is True where the mesh has the same faces in every frame.
+    """
+
+    cloud: PointCloud
+    mesh: Mesh | None = None
+    constant: bool = False
+
+
+@dataclass(frozen=True)
 class Motion:
     """A pose sequence for a 22-joint SMPL-order body.
 

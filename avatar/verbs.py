@@ -33,17 +33,17 @@ VERBS = {
     "canonicalize": Verb(
         "learns an outfit's skinning field and brings its scans to the T-pose",
         "avatar.pipeline.canonicalization:canonicalize",
-        "avatar.training.canonicalizing:CanonicalizeConfig",
+        "avatar.methods.canonicalizer:CanonicalizeConfig",
     ),
     "train": Verb(
         "trains an avatar, or goes on with it",
-        "avatar.pipeline.methods:train",
-        "avatar.training.runs:RunConfig",
+        "avatar.runs.training:train",
+        "avatar.methods.settings:RunConfig",
     ),
     "fit": Verb(
         "fits an unseen outfit from one scan",
-        "avatar.training.fitting:fit_outfit",
-        "avatar.training.fitting:FitConfig",
+        "avatar.runs.fitting:fit_outfit",
+        "avatar.runs.fitting:FitConfig",
     ),
     "predict": Verb(
         "predicts posed point clouds",

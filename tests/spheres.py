@@ -3,7 +3,7 @@
 import torch
 import trimesh
 
-from avatar.nn.closet import ClosetConfig
+from avatar.methods.closet import ClosetConfig
 from avatar.nn.decoders import DecoderConfig
 from avatar.nn.hierarchy import HierarchyConfig
 from avatar.nn.pointnet2 import PointNet2Config

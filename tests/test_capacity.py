@@ -8,11 +8,11 @@ from training.test_runs import distance
 from avatar.data.batches import FrameDataset, FrameName
 from avatar.data.layouts import find_outfit
 from avatar.geometry.surface import sample_surface
-from avatar.nn.closet import ClosetAvatar, ClosetConfig
+from avatar.methods.closet import ClosetAvatar, ClosetConfig
+from avatar.methods.losses import LossConfig
+from avatar.methods.points import PointTask, body_batch, predict
 from avatar.settings import settings_from_dict
-from avatar.training.loop import Trainer
-from avatar.training.losses import LossConfig
-from avatar.training.prediction import body_batch, predict
+from avatar.training.trainer import Trainer
 
 POINTS = 12_000
 
@@ -30,8 +30,7 @@ def test_one_frame_is_learned_to_within_half_of_the_sampling_distance(tmp_path, 
     )
     torch.manual_seed(0)
     model = ClosetAvatar(data.template, 1, settings_from_dict(ClosetConfig, SETTINGS))
-    trainer = Trainer(model, data.template.vertices, data.template.faces, config, tmp_path)
-    trainer.fit(lambda step: frames.batch_at(step, 1), 1, lambda: iter(()))
+    Trainer(PointTask(model, data.template, config, lambda step: frames.batch_at(step, 1), 1), config, tmp_path).fit()
     generator = torch.Generator().manual_seed(1)
     samples = sample_surface(data.template.vertices, data.template.faces, POINTS, generator)
     cloud = predict(model.eval(), body_batch([frame.body], 0, (name,)), samples)

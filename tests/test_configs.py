@@ -16,7 +16,7 @@ from avatar.arguments import refuse_code
 from avatar.checks import AvatarError, DataError
 from avatar.config import CONF, settings_class
 from avatar.config import compose_settings as load
-from avatar.pipeline.methods import find_settings
+from avatar.methods.registry import find_method
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.verbs import VERBS
 
@@ -64,7 +64,7 @@ def paths_of(settings: Any, prefix: str = "") -> Iterator[tuple[str, Path]]:
 @pytest.mark.parametrize("size", SIZES)
 def test_every_method_and_size_gives_its_settings(method, size):
     config = load("train", f"method={method}", f"size={size}")
-    settings = settings_from_dict(find_settings(config.method.name), config.method.settings)
+    settings = settings_from_dict(find_method(config.method.name).Settings, config.method.settings)
     assert config.method.variant == method
     assert config.train.points == {"full": 50_000, "small": 5_000}[size]
     if config.method.name == "closet":
@@ -124,7 +124,7 @@ def test_several_outfits_and_nested_options():
 def test_what_is_wrong_is_refused(override, message):
     if message is None:
         with pytest.raises(AvatarError, match="expected one of closet"):
-            find_settings(load("train", override).method.name)
+            find_method(load("train", override).method.name)
         return
     with pytest.raises((AvatarError, HydraException), match=message):
         load("train", override)

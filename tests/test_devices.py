@@ -24,15 +24,14 @@ from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.motions import write_motion
 from avatar.io.points import read_points
+from avatar.methods.canonicalizer import CanonicalizeConfig, CanonicalizerTask, CycleConfig
+from avatar.methods.settings import MethodChoice, RunConfig, Space
 from avatar.pipeline.canonicalization import canonicalize
-from avatar.pipeline.methods import load_avatar, train
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
+from avatar.runs.fitting import FitConfig, fit_outfit
+from avatar.runs.loading import load_avatar
+from avatar.runs.training import train as train_run
 from avatar.simulate.sequences import authored_motion
-from avatar.training.canonicalizing import CanonicalizeConfig
-from avatar.training.cycles import CycleConfig, CycleTrainer
-from avatar.training.fitting import FitConfig, fit_outfit
-from avatar.training.prediction import garment_template_cloud
-from avatar.training.runs import MethodChoice, RunConfig, Space
 
 pytestmark = pytest.mark.pretended
 UNET = {"levels": 3, "width": 4, "out_channels": 4}
@@ -118,7 +117,7 @@ def runs(tiny_folder, tiny_outfit, tmp_path_factory, device) -> dict[str, RunCon
         )
         if kind == "auto":
             with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-                patch.setattr("avatar.training.cycles.CycleTrainer.batch_at", stopping_at(3))
+                patch.setattr("avatar.methods.canonicalizer.CanonicalizerTask.inputs_at", stopping_at(3))
                 canonicalize(config)
         folder = canonicalize(config)
         for path in (folder / "scans" / "train").glob("*.npz"):
@@ -137,15 +136,15 @@ def runs(tiny_folder, tiny_outfit, tmp_path_factory, device) -> dict[str, RunCon
 
 
 def stopping_at(last: int):
-    """`CycleTrainer.batch_at`, ending in Ctrl-C at a step."""
-    draw = CycleTrainer.batch_at
+    """`CanonicalizerTask.inputs_at`, ending in Ctrl-C at a step."""
+    draw = CanonicalizerTask.inputs_at
 
-    def batch_at(trainer, step: int):
+    def inputs_at(task, step: int):
         if step == last:
             raise KeyboardInterrupt
-        return draw(trainer, step)
+        return draw(task, step)
 
-    return batch_at
+    return inputs_at
 
 
 def weights_of(folder) -> dict:
@@ -179,8 +178,8 @@ def test_a_method_trained_and_predicted_on_the_device_is_the_cpus(runs, name):
         run = replace(run, method=MethodChoice(method, name, settings), space=space)
         pretended.used.clear()
         if kind == "auto" and name in RESUMED:
-            train(replace(run, train=replace(run.train, steps=1)))
-        folder = train(run)
+            train_run(replace(run, train=replace(run.train, steps=1)))
+        folder = train_run(run)
         (points,) = predict(PredictConfig(run=folder, points=1000, device=kind, surface=ExtractionConfig(16, 8)))
         assert bool(pretended.used) == (kind == "auto") and not pretended.used & pretended.BY_CHANCE
         clouds.append([read_points(path) for path in sorted(points.glob("*.ply"))])
@@ -195,7 +194,7 @@ def test_an_outfit_fitted_posed_by_a_motion_and_scored_on_the_device_is_the_cpus
     motion = tmp_path / "stroll.npz"
     write_motion(motion, authored_motion("walk", fps=4, seconds=0.5))
     for kind, run in runs.items():
-        whole = train(replace(run, method=MethodChoice("closet", "whole", SETTINGS)))
+        whole = train_run(replace(run, method=MethodChoice("closet", "whole", SETTINGS)))
         options = {"dataset": "open", "outfit": run.outfit[0], "runs_root": run.runs_root, "device": kind}
         fitted = fit_outfit(
             FitConfig(run=whole, data_root=run.data_root, steps=2, points=500, scan_points=400, **options)
@@ -203,7 +202,8 @@ def test_an_outfit_fitted_posed_by_a_motion_and_scored_on_the_device_is_the_cpus
         (folder,) = predict(PredictConfig(run=fitted, motion=motion, fps=4, points=1000, device=kind))
         predict(PredictConfig(run=fitted, points=1000, device=kind))
         scores = evaluate(EvaluateConfig(runs=(fitted,), floors=False, score=CHEAP)).rows
-        rest = garment_template_cloud(load_avatar(fitted, device=kind), run.outfit[0], 1000)
+        avatar = load_avatar(fitted, device=kind)
+        rest = avatar.method.garment(avatar, run.outfit[0], 1000)
         clouds = [read_points(path).points for path in sorted(folder.glob("*.ply"))]
         found.append((np.concatenate([*clouds, rest.points]), [row.value for row in scores]))
     (mine, scores), (theirs, others) = found

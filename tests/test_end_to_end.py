@@ -20,14 +20,13 @@ from avatar.evaluation.scoring import ScoreConfig
 from avatar.io.meshes import read_mesh
 from avatar.io.motions import write_motion
 from avatar.io.points import read_points
+from avatar.methods.canonicalizer import CanonicalizeConfig, CycleConfig
+from avatar.methods.settings import MethodChoice
 from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.demo import DemoConfig, demo
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
 from avatar.simulate.sequences import authored_motion
-from avatar.training.canonicalizing import CanonicalizeConfig
-from avatar.training.cycles import CycleConfig
-from avatar.training.runs import MethodChoice
 
 pytestmark = pytest.mark.slow
 METRICS = ["cd_point", "cd_pop", "normal_l1", "penetration_share"]

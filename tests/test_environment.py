@@ -12,12 +12,10 @@ import pytest
 from avatar.environment import inspect_package, mending_line
 from avatar.invocation import interpreter
 from avatar.pipeline.torture.miniature import weights_digest, write_data
-from avatar.training.canonicalizing import canonicalize_frames, train_canonicalizer
-from avatar.training.fitting import fit_outfit
-from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
-from avatar.training.implicit_runs import train_implicit
-from avatar.training.prediction import predict_frames, predict_motion
-from avatar.training.runs import train_run
+from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
+from avatar.runs.fitting import fit_outfit
+from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.training import train as train_run
 from avatar.verbs import VERBS, resolve
 
 ROOT = Path(__file__).parents[1]
@@ -149,8 +147,8 @@ def test_who_imports_torch_too_early_is_warned_once(first):
 
 def test_all_that_verbs_and_callers_of_the_package_start_prepares_the_process():
     """Every verb with settings, and the functions that the docs call from Python."""
-    started = [train_run, train_implicit, train_canonicalizer, canonicalize_frames, fit_outfit]
-    started += [predict_frames, predict_motion, predict_implicit_frames, predict_implicit_motion]
+    started = [train_run, train_canonicalizer, canonicalize_frames, fit_outfit]
+    started += [predict_frames, predict_motion]
     started += [resolve(verb.run) for name, verb in VERBS.items() if verb.settings and name != "parameters"]
     assert len(started) > 20
     bare = [f.__qualname__ for f in started if not inspect.getsource(f).startswith("@prepared_process()")]
@@ -182,9 +180,10 @@ def test_a_run_from_python_has_the_bits_of_the_command_s(tmp_path):
         "from pathlib import Path\n"
         "from avatar.io.documents import read_yaml\n"
         "from avatar.settings import settings_from_dict\n"
-        "from avatar.training.runs import RunConfig, train_run\n"
+        "from avatar.methods.settings import RunConfig\n"
+        "from avatar.runs.training import train\n"
         "config = settings_from_dict(RunConfig, read_yaml(Path(sys.argv[1]) / 'config.yaml'))\n"
-        "train_run(replace(config, name='python'))"
+        "train(replace(config, name='python'))"
     )
     in_fresh_python(code, str(folder), **TWO_THREADS)
     assert weights_digest(folder) == weights_digest(folder.with_name("python")) != ""

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from avatar.checks import AvatarError
-from avatar.nn.closet import ClosetConfig
+from avatar.methods.closet import ClosetConfig
+from avatar.methods.settings import TrainConfig
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.training.loop import TrainConfig
 
 
 class Colour(Enum):

@@ -12,10 +12,10 @@ from avatar.geometry.neighbours import nearest
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.io.frames import OpenFrame, OpenGarment, write_manifest, write_open_frame, write_open_garment
+from avatar.methods.losses import LossConfig
+from avatar.methods.settings import Schedule, TrainConfig
 from avatar.records import CanonicalScan
 from avatar.simulate.angles import pose_from_angles
-from avatar.training.loop import Schedule, TrainConfig
-from avatar.training.losses import LossConfig
 
 HIERARCHY = {"points": [256, 64], "radii": [0.3, 1.0], "neighbours": 16}
 ENCODER = {"hierarchy": HIERARCHY, "abstraction": [[16, 16], [32, 32]], "propagation": [[32], [16]]}

@@ -24,21 +24,14 @@ from avatar.export.drawing import Camera, frame_camera, load_pyvista
 from avatar.export.pictures import contact_sheet, render_mesh, render_points, save_picture
 from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, module_digest
+from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole
+from avatar.methods.canonicalizer import CanonicalizeConfig, Skinning, TrainedCanonicalizer
 from avatar.pipeline.scores import current_commit
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
 from avatar.records import Frame, Mesh, PointCloud
-from avatar.training.canonicalizing import (
-    CanonicalizeConfig,
-    Skinning,
-    TrainedCanonicalizer,
-    canonicalize_frames,
-    scans_digest,
-    skinning_source,
-    train_canonicalizer,
-)
-from avatar.training.locks import lock_folder
+from avatar.runs.canonicalizing import canonicalize_frames, scans_digest, skinning_source, train_canonicalizer
 
 COLUMNS = ("scan", "weights", "canonical, front", "canonical, back", "weights, front", "weights, back")
 PICTURE = (480, 480)

@@ -16,13 +16,15 @@ from avatar.evaluation.scoring import ScoreConfig
 from avatar.export.drawing import load_pyvista
 from avatar.export.meshing import require_poisson
 from avatar.io.npz import write_whole
+from avatar.methods.canonicalizer import CanonicalizeConfig
+from avatar.methods.points import check_count
+from avatar.methods.registry import find_method
+from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.pipeline.canonicalization import canonicalize
 from avatar.pipeline.reporting import ReportConfig, report
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import MeshConfig, mesh
-from avatar.training.canonicalizing import CanonicalizeConfig
-from avatar.training.prediction import check_count
-from avatar.training.runs import MethodChoice, RunConfig, train_run
+from avatar.runs.training import train
 
 log = logging.getLogger(__name__)
 
@@ -40,9 +42,9 @@ class DemoConfig(RunConfig):
     def __post_init__(self):
         super().__post_init__()
         check_count(self.points)
-        if self.method.name != "closet":
+        if find_method(self.method.name).static is None:
             raise AvatarError(
-                f"method: expected CloSET or one of its variants, got {self.method.name}; its floor is CloSET's. "
+                f"method: expected one with a static floor (CloSET or one of its variants), got {self.method.name}. "
                 f"Hint: train others by tools/train.py method={self.method.variant}."
             )
 
@@ -65,7 +67,8 @@ def demo(config: DemoConfig) -> Path:
 
     settings = RunConfig(**{f.name: getattr(config, f.name) for f in fields(RunConfig)})
     budget = replace(settings.train, minutes=(settings.train.minutes or 2.0) * config.static_share)
-    static = MethodChoice("closet", "static", settings.method.settings | {"pose": False})
+    name = settings.method.name
+    static = MethodChoice(name, "static", settings.method.settings | dict(find_method(name).static))
     where = {key: getattr(settings, key) for key in ("dataset", "data_root", "runs_root", "device")}
     for outfit in settings.outfits():
         outfit.frames("test")
@@ -77,9 +80,9 @@ def demo(config: DemoConfig) -> Path:
             for outfit in settings.outfit
         ]
     with stage("train"):
-        run = train_run(settings)
+        run = train(settings)
     with stage("train static floor"):
-        floor = train_run(replace(settings, method=static, train=budget))
+        floor = train(replace(settings, method=static, train=budget))
     with stage("predict"):
         folders = [path for folder in (run, floor) for path in predict(PredictConfig(run=folder, points=config.points))]
     with stage("evaluate"):

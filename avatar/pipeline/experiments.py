@@ -14,17 +14,19 @@ from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.export.drawing import load_pyvista
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.nn.closet import Skinning
+from avatar.io.locks import lock_folder
+from avatar.methods.base import CANONICALIZER
+from avatar.methods.canonicalizer import CanonicalizeConfig
+from avatar.methods.points import check_count
+from avatar.methods.registry import find_method
+from avatar.methods.settings import RunConfig
 from avatar.pipeline.canonicalization import check_scored, score_canonical_scans
 from avatar.pipeline.comparison import CompareConfig, compare
-from avatar.pipeline.methods import train
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict, read_all_scores, scores_file
-from avatar.training.canonicalizing import CanonicalizeConfig, canonicalize_frames, train_canonicalizer
-from avatar.training.distributed import current_team
-from avatar.training.implicit_runs import METHOD as SCANIMATE
-from avatar.training.locks import lock_folder
-from avatar.training.prediction import check_count
-from avatar.training.runs import RunConfig, Space
+from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
+from avatar.runs.training import train
+from avatar.settings import settings_from_dict
+from avatar.world import current_world
 
 log = logging.getLogger(__name__)
 
@@ -71,13 +73,13 @@ def experiment(config: ExperimentConfig) -> Path:
     Raises:
         AvatarError: before any work, for what prediction, scores or pictures would refuse after training.
     """
-    run, leads = config.run, current_team().leads
+    run, writes = config.run, current_world().is_main
     check_job(config)
     if takes_canonicalizer(run):
         for outfit in run.outfit:
             prepare_canonicalizer(config, outfit)
     folder = train(run)
-    if leads:
+    if writes:
         score_run(config, folder)
     return folder
 
@@ -100,8 +102,9 @@ def check_job(config: ExperimentConfig) -> None:
 
 def takes_canonicalizer(run: RunConfig) -> bool:
     """Whether a run needs its outfits' canonicalizers."""
-    learned = run.method.settings.get("skinning") == Skinning.learned.value
-    return run.method.name == SCANIMATE or learned or run.space is Space.canonical
+    method = find_method(run.method.name)
+    settings = settings_from_dict(method.Settings, run.method.settings, "method.settings.")
+    return CANONICALIZER in method.needs(run, settings)
 
 
 def canonicalizer_of(config: ExperimentConfig, outfit: str) -> CanonicalizeConfig:

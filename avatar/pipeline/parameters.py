@@ -8,19 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from torch import nn
 
 from avatar.evaluation.tables import Table, TableRow, to_markdown
-from avatar.implicit.avatar import ImplicitAvatar
-from avatar.implicit.body_field import BodyField
 from avatar.io.npz import write_whole
-from avatar.nn.methods import build_avatar
-from avatar.pipeline.methods import find_settings
+from avatar.methods.registry import find_method
+from avatar.methods.settings import MethodChoice
 from avatar.records import Template
 from avatar.settings import settings_from_dict
-from avatar.training.implicit_runs import METHOD as SCANIMATE
-from avatar.training.runs import MethodChoice
 
 CODES, TOTAL = "codes of an outfit", "total without codes"
 ORIGINAL = {  # counted in POP's own network at full size, codes apart
@@ -52,11 +47,8 @@ class Count:
 
 def build_network(choice: MethodChoice, template: Template) -> nn.Module:
     """A method's untrained network for one outfit; learned skinning fields, which runs bring along, are left out."""
-    settings = settings_from_dict(find_settings(choice.name), choice.settings)
-    if choice.name == SCANIMATE:
-        box = torch.stack([template.vertices.amin(dim=0), template.vertices.amax(dim=0)])
-        return ImplicitAvatar(template, BodyField(template), box, settings.avatar)
-    return build_avatar(choice.name, template, 1, settings)
+    method = find_method(choice.name)
+    return method.untrained(settings_from_dict(method.Settings, choice.settings), template)
 
 
 def count_parameters(method: str, size: str, model: nn.Module) -> list[Count]:

@@ -24,12 +24,11 @@ from avatar.export.pictures import (
 from avatar.geometry.trees import build_tree
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
-from avatar.pipeline.methods import load_avatar
+from avatar.methods.base import TrainedAvatar
 from avatar.pipeline.scores import floors_root, predictions_folder, read_all_scores, read_floors, run_outfits
 from avatar.pipeline.surfaces import spaced_frames
-from avatar.records import Frame, PointCloud
-from avatar.training.prediction import body_batch, garment_template_cloud, outfit_index, predict, template_samples
-from avatar.training.runs import TrainedAvatar
+from avatar.records import PointCloud
+from avatar.runs.loading import load_avatar
 
 MAX_ERROR = 0.05  # metres at the hot end of the error pictures
 
@@ -121,10 +120,9 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
             f"distance of predicted points of {name} to the scan",
             f"mean {errors.mean() * 1000:.1f} mm",
         )
-    if getattr(avatar.model, "garment_decoder", None) is not None:
-        pictures[2] = Picture(
-            render_points(posed_template(avatar, outfit.name, frame), camera), f"garment template posed as {name}"
-        )
+    garment = avatar.method.garment(avatar, outfit.name, 50_000, frame.body)
+    if garment is not None:
+        pictures[2] = Picture(render_points(garment, camera), f"garment template posed as {name}")
     mesh = config.run / "meshes" / config.split / outfit.name / f"{name}.ply"
     if mesh.is_file():
         pictures[3] = Picture(render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
@@ -145,17 +143,11 @@ def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
     return contact_sheet(images, column_labels=[COLUMNS[column] for column in kept])
 
 
-def posed_template(avatar: TrainedAvatar, outfit: str, frame: Frame) -> PointCloud:
-    """The garment template alone, skinned to a frame's body."""
-    batch = body_batch([frame.body], outfit_index(avatar, outfit), (frame.name,))
-    return predict(avatar.model, batch, template_samples(avatar, 50_000), wrinkles=False)
-
-
 def template_pictures(avatar: TrainedAvatar, outfit: Outfit) -> list[PictureRow]:
     """The explicit garment template in the canonical pose; no row for methods without one."""
-    if getattr(avatar.model, "garment_decoder", None) is None:
+    cloud = avatar.method.garment(avatar, outfit.name, 50_000)
+    if cloud is None:
         return []
-    cloud = garment_template_cloud(avatar, outfit.name, 50_000)
     picture = Picture(render_points(cloud, frame_camera(cloud.points)), f"garment template of {outfit.name}")
     return [PictureRow(f"{outfit.name}: at rest", (None, None, picture, None, None))]
 

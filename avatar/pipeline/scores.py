@@ -28,14 +28,14 @@ from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdo
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.documents import read_json
 from avatar.io.ledger import Ledger, digest_of, keyed
+from avatar.io.locks import lock_folder
 from avatar.io.motions import read_body_motion
 from avatar.io.npz import write_whole
+from avatar.methods.base import TrainedAvatar
+from avatar.methods.settings import RunConfig
 from avatar.nn.decoders import Normals
-from avatar.pipeline.methods import is_implicit, load_avatar
-from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
-from avatar.training.locks import lock_folder
-from avatar.training.prediction import predict_frames, predict_motion
-from avatar.training.runs import RunConfig, TrainedAvatar
+from avatar.runs.loading import load_avatar
+from avatar.runs.prediction import predict_frames, predict_motion
 
 MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
 
@@ -108,23 +108,14 @@ def predict(config: PredictConfig) -> list[Path]:
     avatar = load_avatar(config.run, config.checkpoint, config.device)
     folders = []
     for outfit in run_outfits(avatar, config.data_root):
-        if config.motion is None:
-            folders.append(predictions_folder(config.run, config.split, outfit.name))
-            if is_implicit(avatar):
-                meshes = meshes_folder(config.run, config.split, outfit.name)
-                options = {"points": config.points, "config": config.surface}
-                predict_implicit_frames(avatar, outfit, config.split, folders[-1], meshes, **options)
-            else:
-                predict_frames(avatar, outfit, config.split, folders[-1], config.points)
+        motion = config.motion and read_body_motion(config.motion, outfit.posable_body(), config.fps, config.up)
+        name = motion.name if motion else config.split
+        folders.append(predictions_folder(config.run, name, outfit.name))
+        where = (folders[-1], meshes_folder(config.run, name, outfit.name), config.points, config.surface)
+        if motion is None:
+            predict_frames(avatar, outfit, config.split, *where)
             continue
-        motion = read_body_motion(config.motion, outfit.posable_body(), config.fps, config.up)
-        folders.append(predictions_folder(config.run, motion.name, outfit.name))
-        if is_implicit(avatar):
-            meshes = meshes_folder(config.run, motion.name, outfit.name)
-            options = {"points": config.points, "config": config.surface}
-            written = predict_implicit_motion(avatar, outfit, motion, folders[-1], meshes, **options)
-        else:
-            written = predict_motion(avatar, outfit, motion, folders[-1], config.points)
+        written = predict_motion(avatar, outfit, motion, *where)
         for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
             path.unlink()  # the end of an earlier prediction with more frames a second
         write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
@@ -189,7 +180,7 @@ def score_runs(config: EvaluateConfig) -> Scores:
             ledger = Ledger(run)
             for outfit in outfits:
                 folder = predictions_folder(run, config.split, outfit.name)
-                meshes = meshes_folder(run, config.split, outfit.name) if is_implicit(avatar) else None
+                meshes = meshes_folder(run, config.split, outfit.name) if avatar.method.makes_meshes else None
                 mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes, ledger)
             save_scores(scores_file(run, config.split), mine, ledger, keyed(SOURCE))
         scores = scores + mine

@@ -13,12 +13,11 @@ from avatar.evaluation.seam_tables import SeamTest, check_baseline, name_of, sea
 from avatar.evaluation.seams import SeamPlaces, measure_seams, seam_places
 from avatar.evaluation.tables import Table, to_markdown
 from avatar.io.npz import write_whole
-from avatar.pipeline.methods import is_implicit, load_avatar
+from avatar.methods.base import TrainedAvatar
 from avatar.pipeline.scores import current_commit, run_outfits, variant_of
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
-from avatar.training.prediction import body_batch, outfit_index, predict
-from avatar.training.runs import TrainedAvatar
+from avatar.runs.loading import load_avatar
 
 
 @dataclass
@@ -76,8 +75,11 @@ def runs_by_outfit(config: SeamsConfig) -> dict[tuple[str, str], list[tuple[Trai
     found: dict[tuple[str, str], list[tuple[TrainedAvatar, Outfit]]] = {}
     for run in config.runs:
         avatar = load_avatar(run)
-        if is_implicit(avatar):
-            raise AvatarError(f"{run}: an implicit avatar has no points at chosen places of the body. Leave it out.")
+        if not avatar.method.on_body:
+            raise AvatarError(
+                f"{run}: expected a method with points at chosen places of the body, got {avatar.method.name}. "
+                "Hint: leave it out."
+            )
         for outfit in run_outfits(avatar, config.data_root):
             found.setdefault((outfit.dataset, outfit.name), []).append((avatar, outfit))
     return found
@@ -97,11 +99,10 @@ def label_of(config: SeamsConfig, avatar: TrainedAvatar) -> Label:
 
 def probe_seams(config: SeamsConfig, avatar: TrainedAvatar, outfit: Outfit, places: SeamPlaces) -> SeamTest:
     """A run asked at places of an outfit's body, for the frames of a split."""
-    index = outfit_index(avatar, outfit.name)
     names = spaced_frames(list(outfit.frames(config.split)), config.frames)
     frames = []
     for name in tracked(names, f"seams of {avatar.config.method.variant} on {outfit.name}"):
         frame = outfit.load(config.split, name)
-        cloud = predict(avatar.model, body_batch([frame.body], index, (name,)), places.samples)
+        cloud = avatar.method.predict_at(avatar, outfit.name, frame.body, places.samples)
         frames.append(measure_seams(cloud, frame.scan, places))
     return SeamTest(label_of(config, avatar), outfit.dataset, outfit.name, tuple(frames))

@@ -15,8 +15,8 @@ from avatar.export.rigged import write_rigged_glb
 from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_body_motion
 from avatar.io.points import read_points
-from avatar.pipeline.methods import is_implicit, load_avatar
 from avatar.pipeline.scores import meshes_folder, predicted_fps, predictions_folder, run_outfits
+from avatar.runs.loading import load_avatar
 
 
 @dataclass
@@ -63,7 +63,7 @@ def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
             raise DataError(folder, "no predictions here.", "Run tools/predict.py first.")
         frames = spaced_frames(sorted(path.stem for path in folder.glob("*.ply")), config.frames)
         target = meshes_folder(config.run, config.predictions, name)
-        if is_implicit(avatar):  # predicting has written its own surfaces
+        if avatar.method.makes_meshes:  # predicting has written its own surfaces
             reports[target] = MeshingReport(skipped=tuple(frames))
             continue
         reports[target] = mesh_folder(folder, target, config.formats, frames, config.poisson)

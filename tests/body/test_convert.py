@@ -22,7 +22,7 @@ from avatar.body.open import open_body
 from avatar.body.packed import packed_body, write_template
 from avatar.body.smpl import joint_tree, smpl_body
 from avatar.checks import AvatarError, DataError
-from avatar.nn.baselines.atlas import Atlas
+from avatar.nn.atlas import Atlas
 from avatar.plain_verbs import convert_body
 
 PROTOCOLS = range(6)

@@ -6,10 +6,10 @@ import pytest
 import torch
 from bodies import random_pose
 
-from avatar.body import BodyConfig, canonical_pose, load_body
 from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
 from avatar.body.packed import write_body
+from avatar.body.registry import BodyConfig, canonical_pose, load_body
 from avatar.checks import AvatarError, DataError
 
 

@@ -23,7 +23,7 @@ from avatar.data.splits import split_outfit
 from avatar.geometry.transforms import transform_points
 from avatar.io.frames import check_manifest, read_open_frame, write_open_frame
 from avatar.io.npz import write_arrays
-from avatar.training.canonicalizing import CanonicalizeConfig
+from avatar.methods.canonicalizer import CanonicalizeConfig
 
 FIT_KEYS = ("vertices", "vertex_transforms", "joint_transforms", "pose_vertices", "translation", "pose")
 SCAN_KEYS = ("points", "normals", "labels", "canonical")

@@ -10,9 +10,9 @@ from avatar.data.outfits import Outfit
 from avatar.geometry.chunks import UNIT, in_chunks
 from avatar.geometry.surface import sample_surface
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
-from avatar.nn.methods import build_avatar, find_method
+from avatar.methods.points import body_batch, predict
+from avatar.methods.registry import find_method
 from avatar.settings import settings_from_dict
-from avatar.training.prediction import body_batch, predict
 
 OUT_OF_MEMORY = [
     torch.OutOfMemoryError("CUDA out of memory."),
@@ -53,7 +53,9 @@ def test_what_never_fits_is_one_error_and_other_errors_pass():
 def test_a_prediction_in_little_memory_is_the_same_to_the_bit(tiny_outfit: Outfit, monkeypatch, threads):
     torch.manual_seed(0)
     template = tiny_outfit.template
-    model = build_avatar("closet", template, 1, settings_from_dict(find_method("closet").settings, SETTINGS)).eval()
+    model = (
+        find_method("closet").network(template, 1, settings_from_dict(find_method("closet").Settings, SETTINGS)).eval()
+    )
     batch = body_batch([tiny_outfit.load("test", tiny_outfit.frames("test")[0]).body], 0, ("a",))
     samples = sample_surface(template.vertices, template.faces, 9001, torch.Generator().manual_seed(1))
     before = torch.get_num_threads()

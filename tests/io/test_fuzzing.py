@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from avatar.checks import AvatarError
-from avatar.pipeline.torture.formats import FORMATS
+from avatar.io.meshes import FORMATS
 
 
 @st.composite

@@ -103,7 +103,7 @@ def test_the_code_that_counts_is_what_a_program_loads_to_run_it():
         ("avatar.geometry.distances", True),  # which metrics import
         ("avatar.data.scanner", True),
         ("avatar.evaluation.plots", False),
-        ("avatar.training.loop", False),
+        ("avatar.training.trainer", False),
     ],
 )
 def test_a_change_counts_where_the_code_that_changed_is_run(change_source, module, counts):

@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from spheres import DECODER, TEMPLATE, random_batch, small_config
+from spheres import TEMPLATE, random_batch, small_config
 from wearers import BodyField, SmoothField, posed_batch, vertex_samples
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
-from avatar.nn.closet import ClosetAvatar, ClosetConfig, PoseLocality, Skinning
+from avatar.methods.closet import ClosetAvatar, ClosetConfig, PoseLocality, Skinning
+from avatar.methods.registry import find_method
 from avatar.nn.decoders import Decoded
 from avatar.nn.hierarchy import HierarchyConfig
 from avatar.nn.locality import LocalPoseConfig
-from avatar.nn.methods import build_avatar, find_method
 from avatar.nn.pointnet2 import PointNet2Config
 from avatar.nn.posing import LearnedSkinning
 from avatar.records import Batch
@@ -186,9 +186,7 @@ def test_every_parameter_gets_a_gradient():
 def test_registry_names_its_methods():
     with pytest.raises(AvatarError, match="closet"):
         find_method("clsoet")
-    with pytest.raises(AvatarError, match="ClosetConfig"):
-        build_avatar("closet", TEMPLATE, 1, DECODER)
-    assert isinstance(build_avatar("closet", TEMPLATE, 1, small_config()), ClosetAvatar)
+    assert isinstance(find_method("closet").untrained(small_config(), TEMPLATE), ClosetAvatar)
 
 
 def test_without_offsets_the_prediction_is_the_bare_body_with_its_normals():

@@ -6,11 +6,11 @@ from cut_sphere import ATLASED
 from spheres import DECODER, random_batch, small_config
 
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
-from avatar.nn.baselines.pop import PopConfig
-from avatar.nn.baselines.scale import ScaleConfig
-from avatar.nn.baselines.unet import UNetConfig
+from avatar.methods.pop import PopConfig
+from avatar.methods.registry import METHODS, find_method
+from avatar.methods.scale import ScaleConfig
 from avatar.nn.decoders import Normals, ShapeDecoder
-from avatar.nn.methods import METHODS, build_avatar
+from avatar.nn.unet import UNetConfig
 
 UV = {"map_size": 32, "pose_encoder": UNetConfig(3, 4, 6)}
 POP = {"pose_decoder": DECODER, "garment_decoder": DECODER, "code_channels": 5}
@@ -28,7 +28,7 @@ def predict(case: str, normals: Normals, decoded: tuple[float, float, float]):
     """A network's prediction for one frame where all its decoders together give one local normal everywhere."""
     torch.manual_seed(0)
     name, settings = CASES[case]
-    model = build_avatar(name, ATLASED, 1, settings(normals)).eval()
+    model = find_method(name).network(ATLASED, 1, settings(normals)).eval()
     decoders = [module for module in model.modules() if isinstance(module, ShapeDecoder)]
     for decoder in decoders:
         torch.nn.init.zeros_(decoder.normal_branch[-1].weight)
@@ -40,10 +40,13 @@ def predict(case: str, normals: Normals, decoded: tuple[float, float, float]):
     return model, batch, samples, model(batch, samples)
 
 
-@pytest.mark.parametrize("name", METHODS)
+POINT_METHODS = [name for name, method in METHODS.items() if method.on_body]
+
+
+@pytest.mark.parametrize("name", POINT_METHODS)
 def test_every_method_corrects_the_bodys_normals_unless_asked_not_to(name):
-    assert METHODS[name].settings().normals is Normals.body
-    assert {case[0] for case in CASES.values()} == set(METHODS)
+    assert METHODS[name].Settings().normals is Normals.body
+    assert {case[0] for case in CASES.values()} == set(POINT_METHODS)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -7,7 +7,7 @@ import torch
 import yaml
 from spheres import TEMPLATE, sphere_template
 
-from avatar.nn.closet import FULL_GARMENT_ENCODER
+from avatar.methods.closet import FULL_GARMENT_ENCODER
 from avatar.nn.encoders import ENCODERS, Encoder, build_encoder
 from avatar.nn.hierarchy import HierarchyConfig, build_levels
 from avatar.nn.pointmlp import GeometricAffine, PointMLP, PointMLPLevel, ResidualPointMLP

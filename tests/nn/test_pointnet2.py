@@ -7,7 +7,7 @@ from spheres import sphere_template
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
-from avatar.nn.closet import FULL_GARMENT_ENCODER, ClosetConfig
+from avatar.methods.closet import FULL_GARMENT_ENCODER, ClosetConfig
 from avatar.nn.decoders import DecoderConfig, ShapeDecoder
 from avatar.nn.hierarchy import HierarchyConfig, build_levels
 from avatar.nn.pointnet2 import FeaturePropagation, PointNet2, PointNet2Config, SetAbstraction

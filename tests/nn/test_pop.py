@@ -11,11 +11,11 @@ from torch.nn.functional import grid_sample
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.nn.baselines.atlas import Atlas, LookUp
-from avatar.nn.baselines.pop import PointSource, PopAvatar, PopConfig
-from avatar.nn.baselines.unet import UNetConfig
-from avatar.nn.closet import ClosetAvatar
-from avatar.nn.methods import build_avatar
+from avatar.methods.closet import ClosetAvatar
+from avatar.methods.pop import PointSource, PopAvatar, PopConfig
+from avatar.methods.registry import find_method
+from avatar.nn.atlas import Atlas, LookUp
+from avatar.nn.unet import UNetConfig
 from avatar.records import SurfaceSamples
 
 
@@ -259,7 +259,7 @@ def test_every_parameter_gets_a_gradient(template):
 
 def test_bodies_without_atlas_and_bad_sizes_are_refused():
     with pytest.raises(AvatarError, match="UV coordinates"):
-        build_avatar("pop", TEMPLATE, 1, PopConfig())
+        find_method("pop").network(TEMPLATE, 1, PopConfig())
     with pytest.raises(AvatarError, match="multiple of 128"):
         PopConfig(map_size=64)
     for wrong in ({"code_channels": 0}, {"smoothing": -1}, {"offset_scale": 0}, {"code_std": -1}):

@@ -9,9 +9,9 @@ from spheres import DECODER, TEMPLATE, random_batch
 
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.nn.baselines.scale import PointNet, PointNetConfig, PoseFeature, ScaleAvatar, ScaleConfig
-from avatar.nn.baselines.unet import UNetConfig
-from avatar.nn.methods import build_avatar
+from avatar.methods.registry import find_method
+from avatar.methods.scale import PointNet, PointNetConfig, PoseFeature, ScaleAvatar, ScaleConfig
+from avatar.nn.unet import UNetConfig
 from avatar.records import SurfaceSamples, Template
 
 BATCH = replace(random_batch(), outfit_ids=torch.zeros(3, dtype=torch.long))
@@ -177,9 +177,9 @@ def test_every_parameter_gets_a_gradient(pose_feature):
 
 def test_bad_uses_are_refused():
     with pytest.raises(AvatarError, match="one outfit, got 2"):
-        build_avatar("scale", ATLASED, 2, ScaleConfig())
+        find_method("scale").network(ATLASED, 2, ScaleConfig())
     with pytest.raises(AvatarError, match="UV coordinates"):
-        build_avatar("scale", TEMPLATE, 1, ScaleConfig())
+        find_method("scale").network(TEMPLATE, 1, ScaleConfig())
     with pytest.raises(AvatarError, match="multiple of 32"):
         ScaleConfig(map_size=48)
     with pytest.raises(AvatarError, match="patches"):

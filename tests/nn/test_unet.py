@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import batch_norm, conv2d, conv_transpose2d, interpolate, leaky_relu, relu
 
 from avatar.checks import AvatarError
-from avatar.nn.baselines.unet import Doubling, UNet, UNetConfig
+from avatar.nn.unet import Doubling, UNet, UNetConfig
 
 
 def parameters(module: torch.nn.Module) -> int:

@@ -11,15 +11,15 @@ from avatar.body.open import open_body
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig
 from avatar.geometry.surface import interpolate, sample_surface
 from avatar.implicit.sdf import PosedSdf, SdfConfig
-from avatar.nn.baselines.pop import PopAvatar, PopConfig
-from avatar.nn.baselines.scale import PointNetConfig, PoseFeature, ScaleAvatar, ScaleConfig
-from avatar.nn.baselines.unet import UNetConfig
-from avatar.nn.closet import ClosetAvatar, ClosetConfig, PoseLocality
+from avatar.methods.closet import ClosetAvatar, ClosetConfig, PoseLocality
+from avatar.methods.pop import PopAvatar, PopConfig
+from avatar.methods.scale import PointNetConfig, PoseFeature, ScaleAvatar, ScaleConfig
 from avatar.nn.decoders import DecoderConfig
 from avatar.nn.encoders import Encoder
 from avatar.nn.hierarchy import HierarchyConfig
 from avatar.nn.locality import LocalPoseConfig
 from avatar.nn.pointnet2 import PointNet2Config, PointNorm
+from avatar.nn.unet import UNetConfig
 from avatar.records import Batch, SurfaceSamples
 
 BODY = open_body()

@@ -11,15 +11,16 @@ from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
 from avatar.evaluation.scores import Score, Scores, write_scores
 from avatar.evaluation.scoring import ScoreConfig
+from avatar.methods.canonicalizer import CanonicalizeConfig
+from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.pipeline import canonicalization, demo, experiments, scores
 from avatar.pipeline.canonicalization import canonicalize
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.demo import DemoConfig
 from avatar.pipeline.experiments import ExperimentConfig, experiment, has_baseline
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
+from avatar.runs.training import train as train_run
 from avatar.simulate.recording import SimulateConfig
-from avatar.training.canonicalizing import CanonicalizeConfig
-from avatar.training.runs import MethodChoice, RunConfig, train_run
 
 
 @pytest.fixture
@@ -57,7 +58,7 @@ def idle(monkeypatch):
     for module, names in {
         canonicalization: ("train_canonicalizer",),
         experiments: ("train", "train_canonicalizer"),
-        demo: ("canonicalize", "train_run"),
+        demo: ("canonicalize", "train"),
     }.items():
         for name in names:
             monkeypatch.setattr(module, name, refuse)

@@ -20,10 +20,10 @@ from avatar.evaluation.forms import Axis, FormConfig, ReportedTable
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.implicit.extraction import ExtractionConfig
+from avatar.methods.canonicalizer import CanonicalizeConfig, Skinning
+from avatar.methods.settings import MethodChoice
 from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.experiments import ExperimentConfig, experiment, tabulate_experiment
-from avatar.training.canonicalizing import CanonicalizeConfig, Skinning
-from avatar.training.runs import MethodChoice
 
 ROOT = Path(__file__).parents[2]
 METRICS = ("cd_point", "normal_l1")

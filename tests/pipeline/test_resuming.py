@@ -17,7 +17,9 @@ from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.export import meshing
 from avatar.export.meshing import PoissonConfig
+from avatar.io.checkpoints import save_checkpoint
 from avatar.io.points import read_points, write_points
+from avatar.methods.settings import RunConfig
 from avatar.pipeline.scores import (
     EvaluateConfig,
     PredictConfig,
@@ -29,10 +31,8 @@ from avatar.pipeline.scores import (
 )
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
 from avatar.pipeline.torture.miniature import folder_of, train_job
+from avatar.runs.loading import load_avatar
 from avatar.settings import settings_from_dict
-from avatar.training import prediction
-from avatar.training.checkpoints import save_checkpoint
-from avatar.training.runs import RunConfig, load_run
 
 ROOT = Path(__file__).parents[2]
 METRICS = ["cd_point", "normal_l1"]
@@ -66,7 +66,7 @@ def test_predict_mesh_and_evaluate_do_what_is_missing_or_damaged_and_nothing_els
     points, frames = {"points": 1500, "device": "cpu"}, 2
     (folder,) = predict(PredictConfig(run=run, **points))
     clouds = sorted(folder.glob("*.ply"))
-    calls = count(prediction, "predict")
+    calls = count(points, "predict")
     predict(PredictConfig(run=run, **points))
     assert calls == []
     sound = spoil(clouds[1])
@@ -199,7 +199,7 @@ def test_two_processes_that_score_the_same_floors_at_once_lose_nothing(tiny_fold
 
 
 def test_what_a_foreign_run_says_of_its_root_is_not_believed(run, tmp_path):
-    config = load_run(run, device="cpu").config
+    config = load_avatar(run, device="cpu").config
     assert floors_root(run, config) == config.runs_root
     assert floors_root(tmp_path / "elsewhere", config) == tmp_path / "elsewhere"
 
@@ -229,11 +229,11 @@ def test_weights_that_do_not_fit_their_description_are_one_error(run, tmp_path):
         ("steps", {"steps": "many"}, "do not fit this run"),
     ):
         with pytest.raises(AvatarError, match=reason):
-            load_run(describe(run, tmp_path / name, **changes), device="cpu")
+            load_avatar(describe(run, tmp_path / name, **changes), device="cpu")
     folder = describe(run, tmp_path / "none")
     (folder / "avatar.json").write_text(json.dumps({"sha256": "0"}))
     with pytest.raises(DataError, match="config is missing"):
-        load_run(folder, device="cpu")
+        load_avatar(folder, device="cpu")
 
 
 @pytest.mark.parametrize("name", ["../up", "/etc", "", "a/b", "a\nb", "x" * 65])

@@ -6,8 +6,9 @@ import pytest
 from tiny import SETTINGS, quick_training
 
 from avatar.checks import AvatarError
+from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.pipeline.seams import SeamsConfig, seams
-from avatar.training.runs import MethodChoice, RunConfig, train_run
+from avatar.runs.training import train as train_run
 
 POP = {"map_size": 16, "code_channels": 4, "code_std": 0.5, "pose_encoder": {"levels": 3, "width": 4}}
 POP |= {"pose_decoder": {"width": 24, "trunk": 2, "branch": 0}}

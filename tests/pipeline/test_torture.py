@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from avatar.checks import AvatarError
+from avatar.environment import Finding
 from avatar.evaluation.scores import read_scores
 from avatar.io import bvh
 from avatar.pipeline.torture import killing, payloads, poisoning, starving
 from avatar.pipeline.torture.damage import flip_trial
-from avatar.pipeline.torture.findings import Finding, all_of, none_of, to_table
+from avatar.pipeline.torture.findings import all_of, none_of, to_table
 from avatar.pipeline.torture.fuzzing import case_of, fuzz_trial, read_spoilt
 from avatar.pipeline.torture.killing import kill_trial
 from avatar.pipeline.torture.miniature import JOBS, STEPS, folder_of, prepare, train_job, weights_digest

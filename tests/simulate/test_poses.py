@@ -10,8 +10,8 @@ from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.simulate.angles import CENTRAL, LIMITS, pose_from_angles
-from avatar.simulate.poses import authored_motion, clear_of_itself, draw_poses, random_angles
-from avatar.simulate.sequences import SEQUENCES
+from avatar.simulate.poses import clear_of_itself, draw_poses, random_angles
+from avatar.simulate.sequences import SEQUENCES, authored_motion
 
 
 @cache

@@ -13,15 +13,18 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "nn"))
 from cut_sphere import ATLASED
 from spheres import ENCODER, TEMPLATE, random_batch, small_config
 
-from avatar.nn.baselines.pop import PopAvatar, PopConfig
-from avatar.nn.baselines.unet import UNetConfig
-from avatar.nn.closet import ClosetAvatar, ClosetConfig
+from avatar.methods.closet import ClosetAvatar, ClosetConfig
+from avatar.methods.losses import LossConfig, point_avatar_loss
+from avatar.methods.points import PointTask
+from avatar.methods.pop import PopAvatar, PopConfig
+from avatar.methods.settings import TrainConfig
 from avatar.nn.decoders import DecoderConfig
 from avatar.nn.pointnet2 import PointNorm
-from avatar.records import Batch
-from avatar.training.distributed import Team, current_team, gather, share_norms, torchrun_team
-from avatar.training.loop import TrainConfig, Trainer
-from avatar.training.losses import LossConfig, point_avatar_loss
+from avatar.nn.shared_norm import synchronize_norms
+from avatar.nn.unet import UNetConfig
+from avatar.records import Batch, Template
+from avatar.training.trainer import Trainer
+from avatar.world import World, current_world, gather, torchrun_world
 
 FRAMES, ALL = 4, slice(None)
 SHARES = {  # outfits of the four frames of a step, of which each process has two
@@ -50,21 +53,28 @@ def batch_of(step: int) -> Batch:
 
 def make_trainer(folder: Path, steps: int, **options) -> Trainer:
     """A small avatar's training; the same weights in every process only because they are sent around."""
-    torch.manual_seed(5 + current_team().rank)
+    torch.manual_seed(5 + current_world().rank)
     model = ClosetAvatar(TEMPLATE, 1, small_config()).double()
     defaults = {"points": 60, "scan_points": 50, "batch": FRAMES, "log_every": 1, "fresh_points": True, "lr": 3e-4}
     loss = LossConfig(normal_start=0.04)  # from the second step, whether the budget ends at 12 or at 20
     config = TrainConfig(steps=steps, save_every=6, validate_every=8, loss=loss, **(defaults | options))
-    return Trainer(model, TEMPLATE.vertices, TEMPLATE.faces, config, folder)
+    return trainer_of(model, TEMPLATE, config, folder)
 
 
-def fit(trainer: Trainer, team: Team) -> None:
+def trainer_of(model: nn.Module, template: Template, config: TrainConfig, folder: Path) -> Trainer:
+    """A point method's trainer, its batches still to be given."""
+    return Trainer(PointTask(model, template, config, batch_of, 2 * FRAMES), config, folder)
+
+
+def fit(trainer: Trainer, world: World) -> None:
     """Trains on this process's shares; three validation batches do not share out evenly among two."""
     checks = [part(random_batch(frames, (0,) * frames)) for frames in (2, 1, 2)]
-    trainer.fit(lambda step: part(batch_of(step), team.share(FRAMES)), 2, lambda: iter(checks))
+    trainer.task.batch_at = lambda step: part(batch_of(step), world.shard(FRAMES))
+    trainer.task.validation = lambda: checks
+    trainer.fit()
 
 
-def norm_errors(team: Team) -> list[float]:
+def norm_errors(world: World) -> list[float]:
     """Largest differences of the shared norms' outputs, gradients and statistics from those of one process."""
     errors = []
     for layer, shape in ((PointNorm(5), (8, 7, 5)), (nn.BatchNorm2d(5), (8, 5, 3, 4))):
@@ -75,13 +85,13 @@ def norm_errors(team: Team) -> list[float]:
         model = nn.Sequential(layer)
         twin = nn.Sequential(type(layer)(5))
         twin.load_state_dict(model.state_dict())
-        share_norms(twin)
-        rows = slice(0, 2) if team.rank == 0 else slice(2, 8)  # unequal shares
+        synchronize_norms(twin)
+        rows = slice(0, 2) if world.rank == 0 else slice(2, 8)  # unequal shares
         whole, mine = features.clone().requires_grad_(), features[rows].clone().requires_grad_()
         expected, found = model(whole), twin(mine)
         (expected * weights).sum().backward()
         (found * weights[rows]).sum().backward()
-        scale = sum(each for each in gather(twin[0].weight.grad, team))
+        scale = sum(each for each in gather(twin[0].weight.grad, world))
         errors += [float((found - expected[rows]).abs().max()), float((mine.grad - whole.grad[rows]).abs().max())]
         errors += [float((scale - layer.weight.grad).abs().max() / scale.abs().max())]
         for name in ("running_mean", "running_var"):
@@ -101,18 +111,18 @@ def two_outfits(method: str) -> nn.Module:
     return PopAvatar(ATLASED, 2, config).double()
 
 
-def outfit_errors(folder: Path, team: Team) -> dict[str, float]:
+def outfit_errors(folder: Path, world: World) -> dict[str, float]:
     """Largest differences of a team's gradients and statistics from those of one process, as shares of their norm."""
     errors, loss = {}, LossConfig(normal_start=0.0, offset=20.0, wrinkle=20.0, wrinkle_normal=1.0, code=10.0)
     config = TrainConfig(batch=FRAMES, points=60, scan_points=50, loss=loss)
     for method in ("closet", "pop"):
         for case, outfits in SHARES.items():
             whole, alone = part(random_batch(FRAMES, outfits)), two_outfits(method)
-            trainer = Trainer(two_outfits(method), TEMPLATE.vertices, TEMPLATE.faces, config, folder)
-            terms, _, norm = trainer.train_step(part(whole, team.share(FRAMES)), trainer.samples_at(0))
-            expected = point_avatar_loss(alone(whole, trainer.samples_at(0)), whole, loss, 0.0)
+            trainer = trainer_of(two_outfits(method), TEMPLATE, config, folder)
+            terms, _, norm = trainer.train_step((part(whole, world.shard(FRAMES)), trainer.task.samples_at(0)))
+            expected = point_avatar_loss(alone(whole, trainer.task.samples_at(0)), whole, loss, 0.0)
             expected.total.backward()
-            logged = trainer.team_mean({name: float(value.detach()) for name, value in terms.raw.items()})
+            logged = trainer.world_mean({name: float(value.detach()) for name, value in terms.raw.items()})
             wanted, found = dict(alone.named_parameters()), dict(trainer.model.named_parameters())
             length = torch.stack([parameter.grad.norm() for parameter in wanted.values()]).norm()
             worst = {name: (found[name].grad - wanted[name].grad).norm() / length for name in wanted}
@@ -124,31 +134,31 @@ def outfit_errors(folder: Path, team: Team) -> dict[str, float]:
     return errors
 
 
-def norms_after_a_bad_frame(folder: Path, team: Team) -> list[float]:
+def norms_after_a_bad_frame(folder: Path, world: World) -> list[float]:
     """Gradient norms of two steps of two outfits, the first with a body of one process that is not finite."""
     whole, config = part(random_batch(FRAMES, (0, 1, 0, 1))), TrainConfig(batch=FRAMES, points=60, scan_points=50)
     broken = replace(whole, vertices=whole.vertices.clone())
     broken.vertices[-1] = torch.nan
-    trainer = Trainer(two_outfits("closet"), TEMPLATE.vertices, TEMPLATE.faces, config, folder)
+    trainer = trainer_of(two_outfits("closet"), TEMPLATE, config, folder)
     return [
-        float(trainer.train_step(part(batch, team.share(FRAMES)), trainer.samples_at(0))[2])
+        float(trainer.train_step((part(batch, world.shard(FRAMES)), trainer.task.samples_at(0)))[2])
         for batch in (broken, whole)
     ]
 
 
 def main(folder: Path, steps: int) -> None:
-    with torchrun_team() as team:
-        facts = {"rank": team.rank, "size": team.size}
-        if team.size > 1 and steps == 20:
-            facts["norms"] = norm_errors(team)
-            facts["outfits"] = outfit_errors(folder, team)
-            facts["bad"] = norms_after_a_bad_frame(folder, team)
+    with torchrun_world() as world:
+        facts = {"rank": world.rank, "size": world.size}
+        if world.size > 1 and steps == 20:
+            facts["norms"] = norm_errors(world)
+            facts["outfits"] = outfit_errors(folder, world)
+            facts["bad"] = norms_after_a_bad_frame(folder, world)
         trainer = make_trainer(folder, steps)
-        fit(trainer, team)
+        fit(trainer, world)
         weights = [float(value.double().sum()) for value in trainer.model.state_dict().values()]
-        facts["agree"] = all(other == weights for other in gather(weights, team))
-        facts["seconds"] = gather(trainer.seconds, team)
-        (folder / f"facts-{team.rank}.json").write_text(json.dumps(facts))
+        facts["agree"] = all(other == weights for other in gather(weights, world))
+        facts["seconds"] = gather(trainer.seconds, world)
+        (folder / f"facts-{world.rank}.json").write_text(json.dumps(facts))
 
 
 if __name__ == "__main__":

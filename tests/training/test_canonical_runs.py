@@ -19,11 +19,13 @@ from avatar.data.splits import SplitConfig
 from avatar.geometry.surface import interpolate, sample_surface
 from avatar.geometry.transforms import transform_points
 from avatar.io.canonical_scans import write_canonical_scan
-from avatar.training.canonical_runs import canonical_outfits, canonicalizer_folder, learned_skinning
-from avatar.training.loop import Schedule
-from avatar.training.losses import LossConfig
-from avatar.training.prediction import body_batch, predict
-from avatar.training.runs import MethodChoice, RunConfig, Space, load_run, train_run
+from avatar.methods.canonicalizer import canonical_outfits, canonicalizer_folder
+from avatar.methods.closet import learned_skinning
+from avatar.methods.losses import LossConfig
+from avatar.methods.points import body_batch, predict
+from avatar.methods.settings import MethodChoice, RunConfig, Schedule, Space
+from avatar.runs.loading import load_avatar
+from avatar.runs.training import train as train_run
 
 FIELD = SkinningFieldConfig(width=16, layers=2, skip=1, orders=1)
 LEARNED = MethodChoice("closet", "closet_learned", SETTINGS | {"skinning": "learned"})
@@ -72,7 +74,7 @@ def loaded(monkeypatch, tiny_outfit):
         asked.append(folder)
         return SimpleNamespace(forward_field=deepcopy(field))
 
-    monkeypatch.setattr("avatar.training.canonicalizing.load_canonicalizer", load)
+    monkeypatch.setattr("avatar.methods.closet.load_canonicalizer", load)
     return asked
 
 
@@ -89,10 +91,10 @@ def surface_of(template, count: int):
 def test_a_run_skinned_by_a_field_comes_back_without_its_canonicalizer(settings, loaded, tiny_outfit, monkeypatch):
     run = train_run(replace(settings, name="skinned"))
     assert [folder.parent.name for folder in loaded] == ["tiny"]
-    monkeypatch.delattr("avatar.training.canonicalizing.load_canonicalizer")
+    monkeypatch.delattr("avatar.methods.closet.load_canonicalizer")
     batch, taught = frame_batch(tiny_outfit), field_of(tiny_outfit.template).state_dict()
     for checkpoint in ("last", "best"):
-        avatar = load_run(run, checkpoint, "cpu")
+        avatar = load_avatar(run, checkpoint, "cpu")
         samples = surface_of(avatar.template, 1000)
         found = avatar.model.skinning.fields[0].state_dict()
         assert all(torch.equal(found[name], value) for name, value in taught.items())  # frozen
@@ -109,7 +111,7 @@ def test_a_field_in_training_goes_on_where_it_stopped(settings, loaded, tiny_out
     train = replace(settings.train, steps=4, schedule=Schedule.constant, loss=LossConfig(normal_start=0.0))
     whole, part = (replace(settings, name=name, method=method, train=train) for name in ("whole", "part"))
     train_run(replace(part, train=replace(train, steps=2)))
-    fields = [load_run(train_run(config), device="cpu").model.skinning.fields[0] for config in (whole, part)]
+    fields = [load_avatar(train_run(config), device="cpu").model.skinning.fields[0] for config in (whole, part)]
     first = field_of(tiny_outfit.template).state_dict()
     for name, value in fields[0].state_dict().items():
         assert torch.equal(value, fields[1].state_dict()[name])
@@ -130,7 +132,7 @@ def test_canonical_space_teaches_what_posed_space_shows(settings, tiny_outfit):
     method = MethodChoice("closet", "closet_canonical", SETTINGS)
     train = quick_training(steps=100, points=1500, scan_points=1500, validate_every=50, save_every=100)
     run = train_run(replace(settings, method=method, space=Space.canonical, train=train))
-    avatar, name = load_run(run, device="cpu"), tiny_outfit.frames("test")[-1]
+    avatar, name = load_avatar(run, device="cpu"), tiny_outfit.frames("test")[-1]
     scan, batch = tiny_outfit.load("test", name).scan, frame_batch(tiny_outfit)
     cloud = predict(avatar.model, batch, surface_of(avatar.template, 4000))
 
@@ -147,10 +149,10 @@ def test_canonical_space_teaches_what_posed_space_shows(settings, tiny_outfit):
 def test_batches_say_which_space_they_are_in(settings, tiny_outfit, monkeypatch, space):
     seen = []
 
-    def look(trainer, batch_at, epoch_length, validation):
-        seen.extend([batch_at(0), *validation()])
+    def look(trainer):
+        seen.extend([trainer.task.batch_at(0), *trainer.task.validation()])
 
-    monkeypatch.setattr("avatar.training.runs.Trainer.fit", look)
+    monkeypatch.setattr("avatar.training.trainer.Trainer.fit", look)
     train_run(replace(settings, method=MethodChoice("closet", f"in_{space.value}", SETTINGS), space=space))
     at_rest = space is Space.canonical
     body = tiny_outfit.template.vertices

@@ -9,7 +9,7 @@ import pytest
 import torch
 from limbs import arm_frame, arm_template, legs_template, skirt_frame
 
-import avatar.training.cycles as cycles
+import avatar.methods.canonicalizer as cycles
 from avatar.body.packed import read_template
 from avatar.body.skinning import skin_transforms
 from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
@@ -26,17 +26,19 @@ from avatar.geometry.transforms import transform_points
 from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
-from avatar.pipeline.canonicalization import canonicalize, carrier, score_canonical_scans, weight_colors
-from avatar.training.canonicalizing import (
+from avatar.methods.canonicalizer import (
     CanonicalizeConfig,
+    CanonicalizerTask,
+    CycleConfig,
     Skinning,
-    canonicalize_frames,
+    fit_latent,
     load_canonicalizer,
-    skinning_source,
-    train_canonicalizer,
+    rate_factor,
 )
-from avatar.training.cycles import CycleConfig, CycleTrainer, find_code, rate_factor
+from avatar.pipeline.canonicalization import canonicalize, carrier, score_canonical_scans, weight_colors
+from avatar.runs.canonicalizing import canonicalize_frames, skinning_source, train_canonicalizer
 from avatar.training.logs import read_log
+from avatar.training.trainer import Trainer
 
 TEMPLATE = arm_template()
 NETS = CanonicalizerConfig(SkinningFieldConfig(width=32, orders=4), SkinningFieldConfig(width=32, orders=4, latent=4))
@@ -45,12 +47,13 @@ SCANS = [prepare_scan(arm_frame(bend), TEMPLATE, 2000) for bend in BENDS]
 DRAW = DrawConfig(scan=64, body=64, edges=16, pool=2000)
 
 
-def make_trainer(folder, scans=SCANS, nets=NETS, **options) -> CycleTrainer:
+def make_trainer(folder, scans=SCANS, nets=NETS, **options) -> Trainer:
     torch.manual_seed(3)
     defaults = {"first_steps": 6, "second_steps": 6, "batch": 2, "draw": DRAW, "log_every": 1, "save_every": 2}
     model = Canonicalizer(TEMPLATE, len(scans), nets)
     names = [f"bend.{i:05d}" for i in range(len(scans))]
-    return CycleTrainer(model, TEMPLATE, scans, names, CycleConfig(**(defaults | options)), folder)
+    config = CycleConfig(**(defaults | options))
+    return Trainer(CanonicalizerTask(model, TEMPLATE, scans, names, config), config, folder)
 
 
 @pytest.mark.parametrize("stop", [3, 6, 7, 10], ids=["first stage", "between", "second stage", "late"])
@@ -59,8 +62,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(tmp_path, monkeyp
     whole.fit()
 
     parts = make_trainer(tmp_path / "parts")
-    draw = parts.batch_at
-    monkeypatch.setattr(parts, "batch_at", lambda step: draw(step) if step < stop else 1 / 0)
+    draw = parts.task.inputs_at
+    monkeypatch.setattr(parts.task, "inputs_at", lambda step: draw(step) if step < stop else 1 / 0)
     with pytest.raises(ZeroDivisionError):
         parts.fit()
     again = make_trainer(tmp_path / "parts")
@@ -78,7 +81,7 @@ def test_the_tree_over_the_body_at_rest_is_built_once(tmp_path, monkeypatch):
     trainer = make_trainer(tmp_path)
     trainer.fit()
     assert built == [len(TEMPLATE.vertices)]
-    find_code(trainer.model, TEMPLATE, SCANS[0], trainer.model.codes[0], replace(trainer.config, code_steps=5))
+    fit_latent(trainer.model, TEMPLATE, SCANS[0], trainer.model.codes[0], replace(trainer.task.config, code_steps=5))
     assert len(built) == 2
 
 
@@ -98,18 +101,18 @@ def test_each_stage_has_an_optimiser_of_its_own(tmp_path):
     trainer = make_trainer(tmp_path)
     counts = []
     for trainer.step in range(8):
-        trainer.train_step(trainer.batch_at(trainer.step))
+        trainer.train_step(trainer.task.inputs_at(trainer.step))
         counts.append(int(trainer.optimiser.state[trainer.model.codes]["step"]))
     assert counts == [1, 2, 3, 4, 5, 6, 1, 2]
 
 
 def test_every_scan_is_seen_once_an_epoch_in_an_order_that_changes(tmp_path):
     trainer = make_trainer(tmp_path)
-    epochs = [[trainer.frame_at(4 * epoch + place) for place in range(4)] for epoch in range(6)]
+    epochs = [[trainer.task.frame_at(4 * epoch + place) for place in range(4)] for epoch in range(6)]
     assert all(sorted(epoch) == [0, 1, 2, 3] for epoch in epochs)
     assert len({tuple(epoch) for epoch in epochs}) > 1
-    assert torch.equal(trainer.batch_at(5).points, make_trainer(tmp_path).batch_at(5).points)
-    assert trainer.batch_at(3).frames.tolist() == [trainer.frame_at(6), trainer.frame_at(7)]
+    assert torch.equal(trainer.task.inputs_at(5)[0].points, make_trainer(tmp_path).task.inputs_at(5)[0].points)
+    assert trainer.task.inputs_at(3)[0].frames.tolist() == [trainer.task.frame_at(6), trainer.task.frame_at(7)]
 
 
 def test_rates_fall_at_half_and_three_quarters():
@@ -128,8 +131,8 @@ def test_each_stage_follows_its_own_schedule(tmp_path, monkeypatch):
     monkeypatch.setattr(cycles, "canonicalization_loss", watch)
     drawn = []
     for trainer.step in range(12):
-        drawn.append(trainer.batch_at(trainer.step).points[:, 0])
-        trainer.train_step(trainer.batch_at(trainer.step))
+        drawn.append(trainer.task.inputs_at(trainer.step)[0].points[:, 0])
+        trainer.train_step(trainer.task.inputs_at(trainer.step))
     rates, together, progress = zip(*seen)
     assert rates == pytest.approx([0.01] * 2 + [1e-3, 1e-4] + [0.002] * 4 + [2e-4] * 2 + [2e-5] * 2)
     assert together == (False,) * 4 + (True,) * 8
@@ -142,7 +145,7 @@ def test_clipping_shortens_the_gradient_before_the_step(tmp_path):
     norms, moved = [], []
     for trainer in (free, clipped):
         before = [value.detach().clone() for value in trainer.model.parameters()]
-        norms.append(trainer.train_step(trainer.batch_at(trainer.step))[1])
+        norms.append(float(trainer.train_step(trainer.task.inputs_at(trainer.step))[2]))
         moved.append(max(float((a.detach() - b).abs().max()) for a, b in zip(trainer.model.parameters(), before)))
     assert norms[0] == norms[1] > 1e-3  # logged unclipped
     assert moved[0] == pytest.approx(4e-3, rel=1e-2) and moved[1] < 4e-4  # Adam's first step is as long as the rate
@@ -160,7 +163,7 @@ def test_a_code_is_found_at_its_own_falling_rate_from_new_points_every_step(monk
 
     monkeypatch.setattr(cycles, "canonicalization_loss", steady)
     config = CycleConfig(code_steps=4, code_lr=0.01, draw=DRAW)
-    found = find_code(model, TEMPLATE, SCANS[2], model.codes[0], config)
+    found = fit_latent(model, TEMPLATE, SCANS[2], model.codes[0], config)
     expected = model.codes[0] - 0.01 * (1 + 1 + 0.1 + 0.01)  # Adam under a constant gradient moves by the rate
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
     assert [progress for _, progress in seen] == [0, 0.25, 0.5, 0.75]
@@ -186,10 +189,9 @@ def test_non_finite_losses_leave_the_weights_alone_and_end_training(tmp_path):
     trainer = make_trainer(tmp_path, scans, first_steps=30)
     before = {name: value.clone() for name, value in trainer.model.named_parameters()}
     trainer.step = 30  # the second stage: points come back to nowhere
-    trainer.optimiser.state.clear()
     with pytest.raises(AvatarError, match=r"not finite for 11 steps.*bend\.0000"):
         for _ in range(20):
-            trainer.train_step(trainer.batch_at(trainer.step))
+            trainer.train_step(trainer.task.inputs_at(trainer.step))
     assert all(torch.equal(value, before[name]) for name, value in trainer.model.named_parameters())
 
 
@@ -212,7 +214,7 @@ def test_a_skirt_is_learned_better_than_the_nearest_leg_says_and_an_unseen_one_f
     torch.manual_seed(0)
     model = Canonicalizer(template, 5, NETS)
     config = CycleConfig(first_steps=150, second_steps=450, batch=5, draw=replace(DRAW, scan=128), code_steps=60)
-    CycleTrainer(model, template, scans, "abcde", config, tmp_path).fit()
+    Trainer(CanonicalizerTask(model, template, scans, "abcde", config), config, tmp_path).fit()
     model.requires_grad_(False)
 
     def learned(frame, scan, code):
@@ -234,16 +236,16 @@ def test_a_skirt_is_learned_better_than_the_nearest_leg_says_and_an_unseen_one_f
 
     frame = skirt_frame((-0.6, 0.2), (0.1, -0.3))
     scan = prepare_scan(frame, template, 2000)
-    found = find_code(model, template, scan, model.codes[4], config)
+    found = fit_latent(model, template, scan, model.codes[4], config)
     before, after = learned(frame, scan, model.codes[4]), learned(frame, scan, found)
     assert after[0] < 0.7 * before[0] and after[1] < before[1], (before, after)
-    assert torch.equal(found, find_code(model, template, scan, model.codes[4], config))
+    assert torch.equal(found, fit_latent(model, template, scan, model.codes[4], config))
 
 
 def test_a_pose_needs_no_code_to_be_found():
     torch.manual_seed(0)
     model = Canonicalizer(TEMPLATE, 4, replace(NETS, latent=Latent.pose))
-    assert torch.equal(find_code(model, TEMPLATE, SCANS[2], model.codes[0], CycleConfig()), SCANS[2].pose)
+    assert torch.equal(fit_latent(model, TEMPLATE, SCANS[2], model.codes[0], CycleConfig()), SCANS[2].pose)
 
 
 @pytest.fixture(scope="module")
@@ -297,7 +299,7 @@ def test_finished_scans_are_left_alone_and_damaged_or_outdated_ones_made_again(
 ):
     files = sorted((folder / "scans").rglob("*.npz"))
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
-    monkeypatch.setattr(cycles.CycleTrainer, "fit", lambda self: pytest.fail("trained again"))
+    monkeypatch.setattr(Trainer, "fit", lambda self: pytest.fail("trained again"))
     train_canonicalizer(settings)
     canonicalize_frames(settings)
     assert all(path.stat().st_mtime_ns == before[path][0] for path in files)
@@ -306,10 +308,10 @@ def test_finished_scans_are_left_alone_and_damaged_or_outdated_ones_made_again(
     assert len(canonicalize_frames(settings)) == len(files)
     assert damaged.read_bytes() == before[damaged][1]  # the same bits again
     before = {path: path.stat().st_mtime_ns for path in files}
-    change_source("avatar.training.loop")  # has no part in scans of weights that are trained
+    change_source("avatar.training.trainer")  # has no part in scans of weights that are trained
     canonicalize_frames(settings)
     assert all(path.stat().st_mtime_ns == before[path] for path in files)
-    for module in ("avatar.canonical.scans", "avatar.training.canonicalizing"):
+    for module in ("avatar.canonical.scans", "avatar.runs.canonicalizing"):
         change_source(module)
         canonicalize_frames(settings)
         assert all(path.stat().st_mtime_ns > before[path] for path in files)

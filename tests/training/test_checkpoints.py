@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from avatar.checks import AvatarError, DataError
-from avatar.training.checkpoints import (
+from avatar.io.checkpoints import (
     MANIFEST,
     load_checkpoint,
     read_manifest,

@@ -12,12 +12,14 @@ import torch
 from torch import nn
 
 from avatar.checks import AvatarError
-from avatar.training.canonicalizing import CanonicalizeConfig, train_canonicalizer
-from avatar.training.checkpoints import load_checkpoint
-from avatar.training.distributed import Team, average, current_team, from_lead, gather, share_norms, torchrun_team
-from avatar.training.implicit_runs import train_implicit
+from avatar.io.checkpoints import load_checkpoint
+from avatar.methods.canonicalizer import CanonicalizeConfig
+from avatar.methods.settings import RunConfig
+from avatar.nn.shared_norm import synchronize_norms
+from avatar.runs.canonicalizing import train_canonicalizer
+from avatar.runs.training import train as train_run
 from avatar.training.logs import read_log
-from avatar.training.runs import RunConfig
+from avatar.world import World, average, broadcast, current_world, gather, torchrun_world
 
 SCRIPT = Path(__file__).parent / "team.py"
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(SCRIPT)]
@@ -98,27 +100,27 @@ def test_a_bad_frame_of_one_process_costs_all_the_step_and_no_more(two):
 def test_a_process_alone_is_a_team_of_one(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "1")
     monkeypatch.setenv("LOCAL_RANK", "0")
-    with torchrun_team() as team:
-        assert team == current_team() == Team(0, 1)
-    assert team.leads and team.share(3) == slice(0, 3)
+    with torchrun_world() as team:
+        assert team == current_world() == World(0, 1)
+    assert team.is_main and team.share(3) == slice(0, 3)
     values = [torch.tensor([2.0])]
     average(values, team)
-    assert values[0] == 2 and gather("a", team) == ["a"] and from_lead("b", team) == "b"
+    assert values[0] == 2 and gather("a", team) == ["a"] and broadcast("b", team) == "b"
 
 
 def test_what_trains_in_one_process_refuses_several(monkeypatch):
-    monkeypatch.setattr("avatar.training.distributed.current_team", lambda: Team(1, 2))
+    monkeypatch.setattr("avatar.world.current_world", lambda: World(1, 2))
     with pytest.raises(AvatarError, match=r"scanimate: expected one process, got 2.*without torchrun"):
-        train_implicit(RunConfig())
+        train_run(RunConfig())
     with pytest.raises(AvatarError, match=r"canonicalizer: expected one process, got 2.*without torchrun"):
         train_canonicalizer(CanonicalizeConfig())
 
 
 def test_shares_cover_the_batch_and_must_be_even():
-    rows = [list(range(12))[Team(rank, 3).share(12)] for rank in range(3)]
+    rows = [list(range(12))[World(rank, 3).share(12)] for rank in range(3)]
     assert rows == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]]
     with pytest.raises(AvatarError, match="batch: expected a multiple of the 2 processes, got 3"):
-        Team(0, 2).share(3)
+        World(0, 2).share(3)
 
 
 def test_norms_of_another_kind_are_refused():
@@ -126,4 +128,4 @@ def test_norms_of_another_kind_are_refused():
         pass
 
     with pytest.raises(AvatarError, match="Conditional"):
-        share_norms(nn.Sequential(Conditional(3)))
+        synchronize_norms(nn.Sequential(Conditional(3)))

@@ -14,13 +14,21 @@ from avatar.checks import AvatarError
 from avatar.data.layouts import find_outfit
 from avatar.data.splits import SplitConfig
 from avatar.geometry.surface import sample_surface
-from avatar.nn.closet import ClosetAvatar, Skinning
-from avatar.training import fitting
-from avatar.training.checkpoints import read_weights
-from avatar.training.fitting import FitConfig, fit_code, fit_outfit
-from avatar.training.losses import LossConfig, point_avatar_loss
-from avatar.training.prediction import body_batch, predict, template_samples
-from avatar.training.runs import WEIGHTS, MethodChoice, RunConfig, TrainedAvatar, load_run, train_run
+from avatar.io.checkpoints import read_weights
+from avatar.methods import points
+from avatar.methods.base import TrainedAvatar
+from avatar.methods.closet import Closet, ClosetAvatar, Skinning
+from avatar.methods.losses import LossConfig, point_avatar_loss
+from avatar.methods.points import body_batch, predict, template_samples
+from avatar.methods.settings import MethodChoice, RunConfig
+from avatar.runs.fitting import FitConfig, fit_outfit
+from avatar.runs.loading import load_avatar
+from avatar.runs.training import WEIGHTS
+from avatar.runs.training import train as train_run
+
+
+def trained(model: ClosetAvatar) -> TrainedAvatar:
+    return TrainedAvatar(Closet(), model.config, model, TEMPLATE, RunConfig(), 0, 0.0)
 
 
 def test_only_the_code_is_learned_and_it_fits_the_scan():
@@ -40,8 +48,8 @@ def test_only_the_code_is_learned_and_it_fits_the_scan():
         return float(terms.raw["scan_to_points"] + terms.raw["points_to_scan"])
 
     mean = model.codes.mean(dim=0, keepdim=True)
-    avatar = TrainedAvatar(model, TEMPLATE, RunConfig(), 0, 0.0)
-    code = fit_code(avatar, batch, config)
+    avatar = trained(model)
+    code = avatar.method.fit_code(avatar, batch, config)
     assert code.shape == mean.shape
     fitted = distance()
     model.codes.data = mean.data
@@ -57,9 +65,9 @@ def test_rates_of_the_code_fall_for_the_second_half(monkeypatch):
         seen.append(model.codes.detach().clone())
         return point_avatar_loss(prediction, *rest)
 
-    monkeypatch.setattr(fitting, "point_avatar_loss", watch)
-    avatar = TrainedAvatar(model, TEMPLATE, RunConfig(), 0, 0.0)
-    seen.append(fit_code(avatar, random_batch(1), FitConfig(steps=8, code_lr=1e-3, points=300)))
+    monkeypatch.setattr(points, "point_avatar_loss", watch)
+    avatar = trained(model)
+    seen.append(avatar.method.fit_code(avatar, random_batch(1), FitConfig(steps=8, code_lr=1e-3, points=300)))
     moved = [float((after - before).abs().max()) for before, after in pairwise(seen)]
     assert moved[0] == pytest.approx(1e-3, rel=1e-3)  # Adam's first step is as long as the rate
     assert all(move > 5e-4 for move in moved[:4]) and all(move < 2e-4 for move in moved[4:])
@@ -88,7 +96,9 @@ def settings(garments, tmp_path_factory) -> FitConfig:
 @pytest.mark.parametrize(("asked", "fitted"), [(None, "rise.00000"), ("rise.00003", "rise.00003")])
 def test_the_scan_that_is_fitted_is_the_first_or_the_one_asked_for(settings, monkeypatch, asked, fitted):
     seen = []
-    monkeypatch.setattr(fitting, "fit_code", lambda avatar, batch, config: seen.append(batch) or avatar.model.codes[:1])
+    monkeypatch.setattr(
+        Closet, "fit_code", lambda method, avatar, batch, config: seen.append(batch) or avatar.model.codes[:1]
+    )
     folder = fit_outfit(replace(settings, frame=asked, name=f"frame-{asked}"))
     assert seen[0].names == (fitted,)
     assert read_weights(folder / WEIGHTS, ("fitted_to",))[1]["fitted_to"] == fitted
@@ -96,7 +106,7 @@ def test_the_scan_that_is_fitted_is_the_first_or_the_one_asked_for(settings, mon
 
 def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_poses(settings):
     folder = fit_outfit(settings)
-    base, fitted = load_run(settings.run), load_run(folder)
+    base, fitted = load_avatar(settings.run), load_avatar(folder)
     assert (folder.parents[2].name, fitted.config.outfit, fitted.steps) == ("closet-fitted", ("unseen",), 60)
     for name, value in base.model.state_dict().items():
         assert name == "codes" or torch.equal(value, fitted.model.state_dict()[name]), name
@@ -118,12 +128,10 @@ def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_pos
     assert error(fitted, fitted.model.codes[0].detach()) < 0.7 * min(tight, start)
 
 
-def test_another_wearer_s_field_is_not_fitted(monkeypatch):
+def test_another_wearer_s_field_is_not_fitted():
     model = ClosetAvatar(TEMPLATE, 1, small_config(skinning=Skinning.learned))
-    avatar = TrainedAvatar(model, TEMPLATE, RunConfig(), 0, 0.0)
-    monkeypatch.setattr(fitting, "load_run", lambda *_, **__: avatar)
     with pytest.raises(AvatarError, match="skinning=body"):
-        fit_outfit(FitConfig())
+        Closet().fit_code(trained(model), random_batch(1), FitConfig())
 
 
 def test_bad_options_are_refused():

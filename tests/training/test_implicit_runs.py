@@ -10,24 +10,26 @@ from scipy.spatial import cKDTree
 from avatar.canonical.rivals import NearestBody
 from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError, DataError
+from avatar.data.canonical_batches import CanonicalFrames, canonical_frame
 from avatar.data.splits import SplitConfig
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.implicit.probing import ProbeConfig
 from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
+from avatar.io.checkpoints import load_checkpoint
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
+from avatar.methods.canonicalizer import CanonicalizeConfig, Skinning
+from avatar.methods.scanimate import ImplicitTask, ImplicitTrainConfig
+from avatar.methods.settings import MethodChoice, Precision, RunConfig, Schedule, TrainConfig
 from avatar.records import Scan
+from avatar.runs.canonicalizing import train_canonicalizer
+from avatar.runs.loading import load_avatar
+from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.training import train as train_run
 from avatar.settings import settings_to_dict
 from avatar.simulate.sequences import authored_motion
-from avatar.training.canonicalizing import CanonicalizeConfig, Skinning, train_canonicalizer
-from avatar.training.checkpoints import load_checkpoint
-from avatar.training.implicit_batches import CanonicalFrames, canonical_frame
-from avatar.training.implicit_loop import ImplicitTrainConfig, ImplicitTrainer
-from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
-from avatar.training.implicit_runs import load_implicit, train_implicit
 from avatar.training.logs import read_log
-from avatar.training.loop import Precision, Schedule, TrainConfig
-from avatar.training.runs import MethodChoice, RunConfig
+from avatar.training.trainer import Trainer
 
 SETTINGS = {
     "avatar": {
@@ -79,7 +81,7 @@ def settings(tiny_folder, tiny_outfit, tmp_path_factory) -> RunConfig:
 
 @pytest.fixture(scope="module")
 def trained(settings):
-    return train_implicit(settings)
+    return train_run(settings)
 
 
 def test_training_learns_and_logs_every_term(settings, trained):
@@ -95,11 +97,11 @@ def test_training_learns_and_logs_every_term(settings, trained):
 
 
 def test_predictions_lie_on_the_posed_scans(trained, tiny_outfit, tmp_path):
-    avatar = load_implicit(trained)
+    avatar = load_avatar(trained)
     assert (avatar.steps, avatar.config.method.name) == (120, "scanimate") and not avatar.model.training
     names = tiny_outfit.frames("test")
-    clouds = predict_implicit_frames(
-        avatar, tiny_outfit, "test", tmp_path / "p", tmp_path / "m", 4000, lambda name: name != names[0], COARSE
+    clouds = predict_frames(
+        avatar, tiny_outfit, "test", tmp_path / "p", tmp_path / "m", 4000, COARSE, lambda name: name != names[0]
     )
     assert [path.stem for path in clouds] == list(names[1:])
     for path in clouds:
@@ -111,23 +113,23 @@ def test_predictions_lie_on_the_posed_scans(trained, tiny_outfit, tmp_path):
         mesh = read_mesh(tmp_path / "m" / path.name)
         red = mesh.colors[:, 0] > 0.5
         assert mesh.vertices[red, 1].mean() > mesh.vertices[~red, 1].mean() + 0.3
-    again = predict_implicit_frames(
-        load_implicit(trained),
+    again = predict_frames(
+        load_avatar(trained),
         tiny_outfit,
         "test",
         tmp_path / "q",
         tmp_path / "n",
         4000,
-        lambda name: name == names[1],
         COARSE,
+        lambda name: name == names[1],
     )
     assert again[0].read_bytes() == clouds[0].read_bytes()
 
 
 def test_a_motion_is_predicted_frame_by_frame(trained, tiny_outfit, tmp_path):
     motion = authored_motion("walk", fps=4, seconds=0.5)
-    posed = predict_implicit_motion(
-        load_implicit(trained), tiny_outfit, motion, tmp_path / "p", tmp_path / "m", 1000, ExtractionConfig(32)
+    posed = predict_motion(
+        load_avatar(trained), tiny_outfit, motion, tmp_path / "p", tmp_path / "m", 1000, ExtractionConfig(32)
     )
     assert len(posed) == len(motion.poses) and posed[0].name == "walk.00000.ply"
     assert np.ptp(read_points(posed[0]).points[:, 1]) > 1.2
@@ -136,33 +138,35 @@ def test_a_motion_is_predicted_frame_by_frame(trained, tiny_outfit, tmp_path):
 def test_a_stopped_run_goes_on_to_the_same_bits(settings, tmp_path):
     short = replace(settings, train=replace(settings.train, steps=4, save_every=2, validate_every=3, schedule="x"))
     short = replace(short, train=replace(short.train, schedule=Schedule.constant, mirror=True))
-    through = load_implicit(train_implicit(replace(short, name="through")))
-    train_implicit(replace(short, name="halves", train=replace(short.train, steps=2)))
-    halves = load_implicit(train_implicit(replace(short, name="halves")))
+    through = load_avatar(train_run(replace(short, name="through")))
+    train_run(replace(short, name="halves", train=replace(short.train, steps=2)))
+    halves = load_avatar(train_run(replace(short, name="halves")))
     for name, value in through.model.state_dict().items():
         assert torch.equal(value, halves.model.state_dict()[name]), name
     assert halves.steps == 4
-    assert load_implicit(replace(short, name="through").folder, "best").steps in (3, 4)
+    assert load_avatar(replace(short, name="through").folder, "best").steps in (3, 4)
 
 
 def test_every_kind_of_pose_input_trains_and_comes_back(settings):
     budget = replace(settings.train, steps=2, validate_every=2)
     for kind in ("global", "none"):
         choice = MethodChoice("scanimate", f"scanimate_{kind}", with_avatar(pose=kind))
-        avatar = load_implicit(train_implicit(replace(settings, method=choice, train=budget)))
+        avatar = load_avatar(train_run(replace(settings, method=choice, train=budget)))
         assert avatar.model.config.pose.value == kind
 
 
 @pytest.fixture
-def make_trainer(trained, tiny_outfit, tmp_path):
+def make_trainer(trained, tiny_outfit, tmp_path, frames):
     """Trainers of copies of the trained avatar, with options of training and settings of the implicit loop."""
 
-    def make(settings: ImplicitTrainConfig | None = None, **options) -> ImplicitTrainer:
-        avatar = load_implicit(trained)
+    def make(settings: ImplicitTrainConfig | None = None, **options) -> Trainer:
+        avatar = load_avatar(trained)
         train = replace(avatar.config.train, schedule=Schedule.constant, **options)
         probes = ProbeConfig(near_points=60, box_points=20, rim_points=20)
         settings = replace(settings or ImplicitTrainConfig(), probes=probes)
-        return ImplicitTrainer(avatar.model, tiny_outfit.template.vertices, train, settings, tmp_path)
+        data = CanonicalFrames(frames, 50, seed=3)
+        task = ImplicitTask(avatar.model, tiny_outfit.template.vertices, train, settings, data)
+        return Trainer(task, train, tmp_path)
 
     return make
 
@@ -170,37 +174,44 @@ def make_trainer(trained, tiny_outfit, tmp_path):
 def test_rates_warm_up_and_decay(make_trainer):
     trainer, factors = make_trainer(ImplicitTrainConfig(), steps=8, warmup=2), []
     for trainer.step in range(8):
-        factors.append(trainer.rate_factor())
+        factors.append(trainer.task.stages[0].factor(trainer.step, trainer.position().progress))
     assert factors == pytest.approx([0.5, 1, 1, 1, 0.1, 0.1, 0.01, 0.01])  # at half and three quarters, as the paper's
-    trainer = make_trainer(ImplicitTrainConfig(decay_at=()), steps=8)
-    trainer.config.schedule, trainer.step = Schedule.cosine, 4
-    assert trainer.rate_factor() == pytest.approx(0.505)
+    task = make_trainer(ImplicitTrainConfig(decay_at=()), steps=8).task
+    task.config.schedule = Schedule.cosine
+    assert task.rate_factor(4, 0.5) == pytest.approx(0.505)
 
 
-def test_clipping_shortens_the_gradient_before_the_step(make_trainer, frames):
-    batch, norms, moved = CanonicalFrames(frames, 50, seed=3).batch_at(0, 2), [], []
+def test_clipping_shortens_the_gradient_before_the_step(make_trainer):
+    norms, moved = [], []
     for clip in (None, 1e-9):
         trainer = make_trainer(clip=clip, lr=1e-3, steps=8)
-        before = [value.detach().clone() for value in trainer.learned]
-        norms.append(trainer.train_step(batch, trainer.space_at(batch, 0))[1])
-        moved.append(max(float((a.detach() - b).abs().max()) for a, b in zip(trainer.learned, before)))
+        (learned,) = trainer.task.groups
+        before = [value.detach().clone() for value in learned]
+        norms.append(float(trainer.train_step(trainer.task.inputs_at(0))[2]))
+        moved.append(max(float((a.detach() - b).abs().max()) for a, b in zip(learned, before)))
     assert norms[0] == norms[1] > 1e-3  # logged unclipped
     assert moved[0] == pytest.approx(1e-3, rel=1e-2) and moved[1] < 1e-4  # Adam's first step is as long as the rate
-    gradients = torch.cat([value.grad.flatten() for value in trainer.learned if value.grad is not None])
+    gradients = torch.cat([value.grad.flatten() for value in learned if value.grad is not None])
     assert float(gradients.norm()) == pytest.approx(1e-9, rel=1e-2)
 
 
 def test_validation_is_a_mean_over_frames_at_the_same_points_in_any_mode(make_trainer, frames):
-    trainer, held_back = make_trainer(steps=8), CanonicalFrames(frames[:3], 50, seed=3)
-    values = trainer.validate(held_back.ordered())
-    single = [trainer.validate(held_back.ordered()[row : row + 1]) for row in range(3)]
+    trainer = make_trainer(steps=8)
+
+    def validate(chosen) -> dict[str, float]:
+        trainer.task.checks = CanonicalFrames(chosen, 50, seed=3)
+        return trainer.validate()
+
+    single = [validate(frames[row : row + 1]) for row in range(3)]
+    values = validate(frames[:3])
     for name, value in values.items():
         assert value == pytest.approx(np.mean([frame[name] for frame in single]), rel=1e-5), name
     trainer.step = 5
     trainer.model.train()
-    assert trainer.validate(held_back.ordered()) == values
-    batch = held_back.batch_at(0, 2)
-    losses = [float(trainer.losses(batch, trainer.space_at(batch, key)).total.detach()) for key in (0, 0, 1)]
+    assert trainer.validate() == values
+    task, position = trainer.task, trainer.position()
+    batch = task.data.batch_at(0, 2)
+    losses = [float(task.loss((batch, task.space_at(batch, key)), position).total.detach()) for key in (0, 0, 1)]
     assert losses[0] == losses[1] != losses[2]  # points in space follow from the step
 
 
@@ -265,20 +276,20 @@ def test_a_mesh_is_spread_into_points_by_area(frames, tiny_outfit):
 
 def test_half_precision_is_refused_for_a_field_that_trains_in_float32():
     with pytest.raises(AvatarError, match=r"train.precision: expected fp32 for scanimate, got bf16"):
-        train_implicit(RunConfig(train=TrainConfig(precision=Precision.bf16)))
+        train_run(RunConfig(method=MethodChoice("scanimate"), train=TrainConfig(precision=Precision.bf16)))
 
 
 def test_what_is_wrong_is_refused_with_what_to_do(settings, trained, tmp_path):
     with pytest.raises(DataError, match=r"tools/canonicalize\.py.*name=other"):
-        train_implicit(replace(settings, name="x", canonical="other"))
+        train_run(replace(settings, name="x", canonical="other"))
     with pytest.raises(AvatarError, match="one outfit at a time"):
-        train_implicit(replace(settings, outfit=("tiny", "tee")))
+        train_run(replace(settings, outfit=("tiny", "tee")))
     with pytest.raises(AvatarError, match=r"method\.settings\.avatr: no such option"):
-        train_implicit(replace(settings, method=MethodChoice("scanimate", "scanimate", {"avatr": {}})))
+        train_run(replace(settings, method=MethodChoice("scanimate", "scanimate", {"avatr": {}})))
     with pytest.raises(AvatarError, match=r"train\.lr.*another name"):
-        train_implicit(replace(settings, train=replace(settings.train, lr=1.0)))
+        train_run(replace(settings, train=replace(settings.train, lr=1.0)))
     with pytest.raises(DataError, match="no such file"):
-        load_implicit(tmp_path)
+        load_avatar(tmp_path)
     plain = settings_to_dict(settings)
     assert plain["method"]["name"] == "scanimate"
 
@@ -293,14 +304,14 @@ def test_frames_without_colours_are_refused_where_colours_are_learned(settings, 
     scans = sorted((source / "plain" / "scans" / "train").glob("*.npz"))
     write_canonical_scan(scans[0], replace(read_canonical_scan(scans[0]), colors=None))
     with pytest.raises(DataError, match=r"no colours.*colored=false"):
-        train_implicit(replace(settings, name="y", canonical="plain"))
+        train_run(replace(settings, name="y", canonical="plain"))
     scans[0].unlink()
     with pytest.raises(DataError, match=r"no canonical scan.*tools/canonicalize\.py"):
-        train_implicit(replace(settings, name="y", canonical="plain"))
+        train_run(replace(settings, name="y", canonical="plain"))
 
 
 def test_a_loss_that_stays_undefined_stops_training_and_saves_nothing_bad(settings):
     wild = replace(settings, name="wild", train=replace(settings.train, lr=1e30, steps=60, save_every=60))
     with pytest.raises(AvatarError, match=r"not finite for 11 steps.*frames rise"):
-        train_implicit(wild)
+        train_run(wild)
     assert not list((wild.folder / "checkpoints").glob("*.pt"))

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from avatar.checks import AvatarError
-from avatar.training.locks import LOCK, lock_folder
+from avatar.io.locks import LOCK, lock_folder
 from avatar.training.signals import Stopped, stop_requests
 
-HOLD = "import sys, time; from pathlib import Path; from avatar.training.locks import lock_folder\n"
+HOLD = "import sys, time; from pathlib import Path; from avatar.io.locks import lock_folder\n"
 HOLD += "with lock_folder(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
 
 

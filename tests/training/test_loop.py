@@ -13,26 +13,36 @@ from spheres import TEMPLATE, random_batch, small_config
 
 from avatar.checks import AvatarError, DataError
 from avatar.io import npz
-from avatar.nn.closet import ClosetAvatar
-from avatar.training import loop
-from avatar.training.checkpoints import load_checkpoint
-from avatar.training.locks import HELD, lock_folder
+from avatar.io.checkpoints import load_checkpoint
+from avatar.io.locks import HELD, lock_folder
+from avatar.methods import points
+from avatar.methods.closet import ClosetAvatar
+from avatar.methods.losses import TERMS, LossConfig, point_avatar_loss
+from avatar.methods.points import PointTask
+from avatar.methods.settings import Schedule, TrainConfig
 from avatar.training.logs import read_log
-from avatar.training.loop import Schedule, TrainConfig, Trainer
-from avatar.training.losses import TERMS, LossConfig, point_avatar_loss
 from avatar.training.signals import Stopped
+from avatar.training.trainer import Trainer
 
 
 def make_trainer(folder: Path, **options) -> Trainer:
     torch.manual_seed(3)
     defaults = {"points": 60, "scan_points": 50, "batch": 3, "log_every": 1, "fresh_points": True, "lr": 1e-2}
     model = ClosetAvatar(TEMPLATE, 2, small_config(pose_noise=0.01))
-    return Trainer(model, TEMPLATE.vertices, TEMPLATE.faces, TrainConfig(**(defaults | options)), folder)
+    config = TrainConfig(**(defaults | options))
+    return Trainer(PointTask(model, TEMPLATE, config, lambda step: random_batch(), 6), config, folder)
 
 
 def fit(trainer: Trainer, batches=None) -> Trainer:
-    trainer.fit(batches or (lambda step: random_batch()), 2, lambda: iter([random_batch(2)]))
+    trainer.task.batch_at = batches or trainer.task.batch_at
+    trainer.task.validation = lambda: [random_batch(2)]
+    trainer.fit()
     return trainer
+
+
+def validate(trainer: Trainer, batches) -> dict[str, float]:
+    trainer.task.validation = lambda: batches
+    return trainer.validate()
 
 
 @pytest.mark.parametrize("stop", [3, 4, 7])
@@ -164,12 +174,10 @@ def test_rates_follow_their_schedule(tmp_path):
     trainer = make_trainer(tmp_path, steps=100, schedule=Schedule.cosine, warmup=10)
     factors = []
     for trainer.step in (0, 9, 50, 100):
-        factors.append(trainer.rate_factor())
+        factors.append(trainer.task.stages[0].factor(trainer.step, trainer.position().progress))
     expected = [0.1, 0.01 + 0.495 * (1 + math.cos(0.09 * math.pi)), 0.505, 0.01]
     assert factors == pytest.approx(expected, abs=2e-3)
-    flat = make_trainer(tmp_path, steps=100)
-    flat.step = 99
-    assert flat.rate_factor() == 1
+    assert TrainConfig(steps=100).rate_factor(99, 0.99) == 1
 
 
 def test_normals_are_not_trained_before_their_term_starts(tmp_path):
@@ -179,7 +187,7 @@ def test_normals_are_not_trained_before_their_term_starts(tmp_path):
     before = [value.clone() for value in last]
     for step in range(10):
         trainer.step = step
-        trainer.train_step(random_batch(), trainer.samples_at(trainer.step))
+        trainer.train_step((random_batch(), trainer.task.samples_at(trainer.step)))
         moved = not all(torch.equal(value, old) for value, old in zip(last, before))
         assert moved == (step >= 5)
 
@@ -188,7 +196,7 @@ def changes(trainer: Trainer) -> dict[str, float]:
     """The longest way that one training step moves a number of each parameter."""
     after = list(trainer.model.named_parameters())
     before = [value.detach().clone() for _, value in after]
-    trainer.train_step(random_batch(), trainer.samples_at(trainer.step))
+    trainer.train_step((random_batch(), trainer.task.samples_at(trainer.step)))
     return {name: float((value.detach() - was).abs().max()) for (name, value), was in zip(after, before)}
 
 
@@ -198,7 +206,7 @@ def test_codes_and_networks_move_at_their_own_rates(tmp_path):
     assert moved.pop("codes") == pytest.approx(3e-4 / 4, rel=1e-3)
     assert max(moved.values()) == pytest.approx(1e-2 / 4, rel=1e-3)
     trainer = make_trainer(tmp_path, lr=1e-2, warmup=4)
-    assert trainer.train_step(random_batch(), trainer.samples_at(0))[1] == pytest.approx(1e-2 / 4)  # logged
+    assert trainer.train_step((random_batch(), trainer.task.samples_at(0)))[1] == pytest.approx(1e-2 / 4)  # logged
 
 
 def test_rates_of_pop_are_the_defaults():
@@ -213,7 +221,7 @@ def test_clipping_shortens_the_gradient_before_the_step_and_logs_it_unclipped(tm
     norms = []
     for trainer in (free, clipped):
         torch.manual_seed(0)  # the same noise on the bodies
-        norms.append(float(trainer.train_step(random_batch(), trainer.samples_at(0))[2]))
+        norms.append(float(trainer.train_step((random_batch(), trainer.task.samples_at(0)))[2]))
     assert norms[0] == norms[1] > 1e-3
     gradients = [[value.grad for value in trainer.model.parameters()] for trainer in (free, clipped)]
     assert float(torch.cat([g.flatten() for g in gradients[1]]).norm()) == pytest.approx(1e-9, rel=1e-2)
@@ -224,39 +232,39 @@ def test_clipping_shortens_the_gradient_before_the_step_and_logs_it_unclipped(tm
 
 def test_late_loss_terms_follow_the_progress_and_count_in_validation(tmp_path, monkeypatch):
     trainer, seen = make_trainer(tmp_path, steps=30), []
-    monkeypatch.setattr(loop, "point_avatar_loss", lambda *given: seen.append(given[3]) or point_avatar_loss(*given))
+    monkeypatch.setattr(points, "point_avatar_loss", lambda *given: seen.append(given[3]) or point_avatar_loss(*given))
     for trainer.step in (0, 15):
-        trainer.train_step(random_batch(), trainer.samples_at(trainer.step))
-    trainer.validate([random_batch()])
+        trainer.train_step((random_batch(), trainer.task.samples_at(trainer.step)))
+    validate(trainer, [random_batch()])
     assert seen == [0, 0.5, 1]
 
 
 def test_validation_asks_the_evaluated_network_and_leaves_it_as_it_was(tmp_path):
     trainer = make_trainer(tmp_path)
-    trainer.train_step(random_batch(), trainer.samples_at(trainer.step))
+    trainer.train_step((random_batch(), trainer.task.samples_at(trainer.step)))
     before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
     larger = random_batch()
     batches = [random_batch(2), replace(larger, scan_points=3 * larger.scan_points)]
-    values = trainer.validate(batches)
+    values = validate(trainer, batches)
     assert all(torch.equal(value, before[name]) for name, value in trainer.model.state_dict().items())
     model, expected = trainer.model.eval(), dict.fromkeys(("loss", "chamfer", "normal"), 0.0)
     for batch in batches:
-        terms = point_avatar_loss(model(batch, trainer.samples_at(-1)), batch, trainer.config.loss, 1.0)
+        terms = point_avatar_loss(model(batch, trainer.task.fixed_points), batch, trainer.budget.loss, 1.0)
         raw, share = terms.raw, len(batch.names) / 5  # a mean over frames, not over batches
         expected["loss"] += share * float(terms.total.detach())
         expected["chamfer"] += share * float(raw["scan_to_points"] + raw["points_to_scan"])
         expected["normal"] += share * float(raw["normal"])
     assert {name: values[name] for name in expected} == pytest.approx(expected, rel=1e-5)
-    assert trainer.validate(iter(())) == {}
-    trainer.train_step(random_batch(), trainer.samples_at(trainer.step))  # goes on as training: running statistics move
+    assert validate(trainer, ()) == {}
+    trainer.train_step((random_batch(), trainer.task.samples_at(trainer.step)))  # running statistics move
     running = [name for name in before if name.endswith("running_mean")]
     assert not any(torch.equal(trainer.model.state_dict()[name], before[name]) for name in running)
 
 
 def test_template_points_are_fixed_or_fresh(tmp_path):
-    fixed, fresh = make_trainer(tmp_path, fresh_points=False), make_trainer(tmp_path)
-    assert fixed.samples_at(0) is fixed.samples_at(5) is fixed.samples_at(-1)  # drawn once
-    assert torch.equal(fixed.samples_at(0).barycentric, fresh.samples_at(-1).barycentric)  # those of validation
+    fixed, fresh = make_trainer(tmp_path, fresh_points=False).task, make_trainer(tmp_path).task
+    assert fixed.samples_at(0) is fixed.samples_at(5) is fixed.fixed_points  # drawn once
+    assert torch.equal(fixed.samples_at(0).barycentric, fresh.fixed_points.barycentric)  # those of validation
     assert not torch.equal(fresh.samples_at(0).barycentric, fresh.samples_at(5).barycentric)
     assert torch.equal(fresh.samples_at(5).barycentric, fresh.samples_at(5).barycentric)
 
@@ -274,18 +282,18 @@ def test_non_finite_losses_leave_the_weights_alone_and_end_training(tmp_path):
 def test_a_bad_step_leaves_no_trace(tmp_path):
     """Running statistics too: a forward pass in training changes them before anyone knows that the loss is bad."""
     trainer = make_trainer(tmp_path, steps=30)
-    samples = trainer.fixed_points
-    trainer.train_step(random_batch(), samples)
+    samples = trainer.task.fixed_points
+    trainer.train_step((random_batch(), samples))
     before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
     moments = [value.clone() for group in trainer.optimiser.state.values() for value in group.values()]
     good = random_batch()
     broken = replace(good, pose_vertices=torch.full_like(good.pose_vertices, float("inf")))
-    assert not math.isfinite(float(trainer.train_step(broken, samples)[2]))
+    assert not math.isfinite(float(trainer.train_step((broken, samples))[2]))
     for name, value in trainer.model.state_dict().items():
         assert torch.equal(value, before[name]) or name.endswith("num_batches_tracked"), name
     after = [value for group in trainer.optimiser.state.values() for value in group.values()]
     assert all(torch.equal(a, b) for a, b in zip(moments, after))
-    trainer.train_step(good, samples)
+    trainer.train_step((good, samples))
     trainer.save(0.0)
 
 

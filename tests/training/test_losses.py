@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from avatar.checks import AvatarError
+from avatar.methods.losses import TERMS, Chamfer, LossConfig, point_avatar_loss
 from avatar.records import Batch, Prediction
-from avatar.training.losses import TERMS, Chamfer, LossConfig, point_avatar_loss
 
 
 def plane(count: int, height: float, generator: torch.Generator) -> torch.Tensor:

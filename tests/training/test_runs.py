@@ -13,31 +13,21 @@ from avatar.checks import AvatarError, DataError
 from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
+from avatar.io.checkpoints import save_checkpoint
 from avatar.io.points import read_points
-from avatar.nn.closet import ClosetConfig
+from avatar.methods.base import TrainedAvatar
+from avatar.methods.closet import ClosetConfig
+from avatar.methods.points import body_batch, predict, template_samples
+from avatar.methods.registry import find_method
+from avatar.methods.settings import MethodChoice, Precision, RunConfig
+from avatar.runs.loading import choose_weights, load_avatar
+from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.training import mean_template
+from avatar.runs.training import train as train_run
 from avatar.settings import settings_from_dict
 from avatar.simulate.sequences import authored_motion
-from avatar.training.checkpoints import save_checkpoint
 from avatar.training.logs import read_log
-from avatar.training.loop import Precision, Trainer
-from avatar.training.prediction import (
-    body_batch,
-    outfit_index,
-    predict,
-    predict_frames,
-    predict_motion,
-    template_samples,
-)
-from avatar.training.runs import (
-    MethodChoice,
-    RunConfig,
-    TrainedAvatar,
-    choose_weights,
-    fresh_avatar,
-    load_run,
-    mean_template,
-    train_run,
-)
+from avatar.training.trainer import Trainer
 
 POSE = ("pose_vertices", "vertices", "vertex_transforms", "joint_transforms")
 TENSORS = (*POSE, "scan_points", "scan_normals", "outfit_ids")
@@ -68,7 +58,7 @@ def distance(points: np.ndarray, scan: np.ndarray) -> float:
 
 
 def held_out_error(folder, outfit) -> float:
-    avatar, samples = load_run(folder), None
+    avatar, samples = load_avatar(folder), None
     errors = []
     for name in outfit.frames("test"):
         frame = outfit.load("test", name)
@@ -103,18 +93,18 @@ def test_training_in_half_precision_learns_what_float32_learns(settings, trained
 
 @pytest.mark.slow
 def test_a_run_comes_back_as_it_was_trained(settings, trained, tiny_outfit, tmp_path):
-    avatar = load_run(trained)
+    avatar = load_avatar(trained)
     assert avatar.steps == settings.train.steps
     assert not avatar.model.training
-    paths = predict_frames(avatar, tiny_outfit, "test", tmp_path / "a", 2000)
+    paths = predict_frames(avatar, tiny_outfit, "test", tmp_path / "a", tmp_path, 2000)
     assert [path.stem for path in paths] == list(tiny_outfit.frames("test"))
-    again = predict_frames(load_run(trained), tiny_outfit, "test", tmp_path / "b", 2000)
+    again = predict_frames(load_avatar(trained), tiny_outfit, "test", tmp_path / "b", tmp_path, 2000)
     assert all(a.read_bytes() == b.read_bytes() for a, b in zip(paths, again))
     assert read_points(paths[0]).points.shape == (2000, 3)
-    best = load_run(trained, "best")
+    best = load_avatar(trained, "best")
     assert best.steps in (130, 260)
     motion = authored_motion("walk", fps=10, seconds=0.5)
-    posed = predict_motion(avatar, tiny_outfit, motion, tmp_path / "m", 1000)
+    posed = predict_motion(avatar, tiny_outfit, motion, tmp_path / "m", tmp_path, 1000)
     assert len(posed) == len(motion.poses)
     assert np.ptp(read_points(posed[0]).points[:, 1]) > 1.2
 
@@ -129,25 +119,26 @@ def test_going_on_with_other_settings_is_refused(settings, trained):
 @pytest.mark.slow
 def test_damaged_and_unfinished_runs_are_refused(trained, tmp_path):
     with pytest.raises(DataError, match=r"avatar\.safetensors.*no such file.*tools/train\.py"):
-        load_run(tmp_path)
+        load_avatar(tmp_path)
     copy = tmp_path / "run"
     copy.mkdir()
     for name in ("avatar.safetensors", "avatar.json", "template.npz"):
         (copy / name).write_bytes((trained / name).read_bytes())
-    assert load_run(copy).steps == 260
+    assert load_avatar(copy).steps == 260
     with pytest.raises(DataError, match="no best checkpoint"):
-        load_run(copy, "best")
+        load_avatar(copy, "best")
     (copy / "avatar.safetensors").write_bytes(b"x" * 100)
     with pytest.raises(DataError, match="sha256"):
-        load_run(copy)
+        load_avatar(copy)
 
 
 def test_a_mirroring_run_learns_from_half_of_its_frames_in_a_mirror(settings, tiny_outfit, monkeypatch):
-    """Through `train_run`: what the network sees of the pose and what it is compared with, both or neither."""
+    """Through `train`: what the network sees of the pose and what it is compared with, both or neither."""
     drawn = {}
 
-    def note(trainer, batch_at, epoch_length, validation):
-        drawn[trainer.config.mirror] = [batch_at(step) for step in range(6)], list(validation())
+    def note(trainer):
+        task = trainer.task
+        drawn[task.config.mirror] = [task.batch_at(step) for step in range(6)], list(task.validation())
 
     monkeypatch.setattr(Trainer, "fit", note)
     for mirror in (False, True):
@@ -170,12 +161,13 @@ def test_a_mirroring_run_learns_from_half_of_its_frames_in_a_mirror(settings, ti
 
 def test_fresh_networks_follow_the_seed(settings, tiny_outfit):
     one, again, other = (
-        fresh_avatar(
+        find_method("closet")
+        .prepare(
             replace(settings, train=replace(settings.train, seed=seed)),
             settings_from_dict(ClosetConfig, SETTINGS),
             tiny_outfit.template,
-            [tiny_outfit],
-        ).codes
+        )
+        .model.codes
         for seed in (1, 1, 2)
     )
     assert torch.equal(one, again) and not torch.equal(one, other)
@@ -204,10 +196,12 @@ def test_point_counts_and_outfits_out_of_range_are_refused(settings, tiny_outfit
         template_samples(tiny_outfit.template, 400_001)
     with pytest.raises(DataError, match=r"no such outfit.*Did you mean 'tiny'"):
         train_run(replace(settings, outfit=("tinny",)))
-    avatar = TrainedAvatar(torch.nn.Identity(), tiny_outfit.template, replace(settings, outfit=("tee", "tiny")), 0, 0.0)
-    assert [outfit_index(avatar, name) for name in ("tee", "tiny")] == [0, 1]
+    config = replace(settings, outfit=("tee", "tiny"))
+    closet, model = find_method("closet"), torch.nn.Identity()
+    avatar = TrainedAvatar(closet, ClosetConfig(), model, tiny_outfit.template, config, 0, 0.0)
+    assert [avatar.outfit_index(name) for name in ("tee", "tiny")] == [0, 1]
     with pytest.raises(AvatarError, match=r"trained on tee, tiny, not on 'skirt'"):
-        outfit_index(avatar, "skirt")
+        avatar.outfit_index("skirt")
     with pytest.raises(AvatarError, match="different outfits"):
         replace(settings, outfit=("tiny", "tiny"))
     with pytest.raises(AvatarError, match="device: expected auto, cpu"):

@@ -12,12 +12,14 @@ from torch import nn
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
 from avatar.data.open_layout import OpenOutfit
-from avatar.nn.methods import build_avatar, draw_samples, find_method
+from avatar.methods.points import draw_samples
+from avatar.methods.registry import build_avatar, find_method
+from avatar.methods.settings import TrainConfig
 from avatar.pipeline.benchmarks.races import Job, Race, Run
 from avatar.records import Batch, Template
+from avatar.runs.prediction import predict
 from avatar.settings import settings_from_dict
-from avatar.training.loop import TrainConfig, Trainer
-from avatar.training.prediction import predict
+from avatar.training.trainer import Trainer
 
 EAGER = "compiling needs CUDA here: the main job never compiles, for it would need a C++ compiler on a bare machine"
 
@@ -37,7 +39,7 @@ def sample_batch(frames: int, scan_points: int) -> tuple[Template, Batch]:
 def make_avatar(job: Job, label: str, template: Template, outfits: int = 1) -> nn.Module:
     """A fresh network by its label: the method's name and a size."""
     name = label.split("_")[0]
-    settings: Any = settings_from_dict(find_method(name).settings, job.avatars[label], f"avatars.{label}.")
+    settings: Any = settings_from_dict(find_method(name).Settings, job.avatars[label], f"avatars.{label}.")
     torch.manual_seed(0)
     return build_avatar(name, template, outfits, settings).to(job.device)
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import torch
 
-from avatar.checks import AvatarError
-from avatar.data.outfits import SAFE_NAME
+from avatar.checks import SAFE_NAME, AvatarError
 from avatar.environment import choose_device, prepared_process
 from avatar.evaluation.scores import Scores, write_scores
+from avatar.evaluation.tables import to_markdown
 from avatar.io.npz import write_whole
 from avatar.pipeline.benchmarks.avatars import predict_races, step_races
 from avatar.pipeline.benchmarks.ceilings import ceiling_figures
@@ -27,7 +27,7 @@ from avatar.pipeline.benchmarks.memory import peak_memory
 from avatar.pipeline.benchmarks.races import Figure, Job, Race, run_race
 from avatar.pipeline.benchmarks.search import chamfer_races, nearest_races
 from avatar.pipeline.benchmarks.surfaces import canonicalizer_races, extraction_races, poisson_races, simulation_races
-from avatar.pipeline.benchmarks.tables import MACHINE, keep_others, to_markdown, to_scores
+from avatar.pipeline.benchmarks.tables import MACHINE, keep_others, to_scores
 from avatar.pipeline.scores import current_commit
 
 RACES: dict[str, Callable[[Job], list[Race]]] = {

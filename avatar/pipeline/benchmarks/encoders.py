@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from avatar.nn.closet import ClosetConfig
+from avatar.methods.closet import ClosetConfig
 from avatar.nn.hierarchy import Level
 from avatar.nn.pointnet2 import FeaturePropagation, PointNet2, SetAbstraction
 from avatar.pipeline.benchmarks.avatars import sample_batch

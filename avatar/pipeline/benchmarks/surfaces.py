@@ -15,6 +15,7 @@ from avatar.canonical.posed import prepare_scan
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
 from avatar.implicit.sdf import PosedSdf, SdfConfig
+from avatar.methods.canonicalizer import CycleConfig, CycleTrainer
 from avatar.pipeline.benchmarks.avatars import sample_outfit
 from avatar.pipeline.benchmarks.races import Job, Race, Run, absence
 from avatar.records import Mesh, PointCloud
@@ -23,7 +24,6 @@ from avatar.simulate.dressing import TravelConfig
 from avatar.simulate.outfits import outfit
 from avatar.simulate.poses import draw_poses
 from avatar.simulate.production import dress
-from avatar.training.cycles import CycleConfig, CycleTrainer
 
 
 def canonicalizer_races(job: Job) -> list[Race]:

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from avatar.checks import DataError
-from avatar.pipeline.torture.findings import Finding, all_of, none_of
+from avatar.environment import Finding
+from avatar.io.checkpoints import load_checkpoint, read_manifest, read_weights
+from avatar.pipeline.torture.findings import all_of, none_of
 from avatar.pipeline.torture.judges import bits
 from avatar.pipeline.torture.miniature import folder_of, prepare, train_job
 from avatar.pipeline.torture.victims import work_alone
-from avatar.training.checkpoints import load_checkpoint, read_manifest, read_weights
 
 
 def flip_trial(root: Path, flips: int, truncations: int, seed: int) -> list[Finding]:

@@ -22,11 +22,13 @@ from avatar.body.packed import packed_body
 from avatar.body.smpl import joint_tree, smpl_body
 from avatar.io.bvh import read_bvh
 from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
+from avatar.io.checkpoints import load_checkpoint, read_weights, save_checkpoint, write_weights
 from avatar.io.documents import read_yaml
 from avatar.io.frames import read_open_frame, read_open_garment
 from avatar.io.meshes import read_mesh, write_mesh
 from avatar.io.motions import read_motion, write_motion
 from avatar.io.points import read_points, write_points
+from avatar.methods.settings import RunConfig
 from avatar.pipeline.torture.judges import (
     judge_body,
     judge_bvh,
@@ -44,8 +46,6 @@ from avatar.pipeline.torture.miniature import run_config
 from avatar.pipeline.torture.mutators import NUMBERS, spoil_array
 from avatar.records import CanonicalScan, Mesh, Motion, PointCloud
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.training.checkpoints import load_checkpoint, read_weights, save_checkpoint, write_weights
-from avatar.training.runs import RunConfig
 
 SCORE = 0.5  # validation score of the checkpoints
 SHARED = {"weight": torch.arange(64.0)}  # weights to share
@@ -327,7 +327,7 @@ def make_config(folder: Path) -> Path:
 
 
 def read_config(path: Path) -> Any:
-    """A run's settings, as `save_settings` and `load_run` take them."""
+    """A run's settings, as `save_settings` and `load_avatar` take them."""
     return settings_from_dict(RunConfig, read_yaml(path), f"{path}: ")
 
 

@@ -19,10 +19,13 @@ import numpy as np
 import torch
 
 from avatar.checks import AvatarError
+from avatar.environment import Finding
+from avatar.geometry.uv import INSIDE
+from avatar.io.meshes import FORMATS
 from avatar.io.npz import write_whole
-from avatar.pipeline.torture.findings import Finding, none_of
-from avatar.pipeline.torture.formats import FORMATS, forge
-from avatar.pipeline.torture.mutators import INSIDE, MUTATORS
+from avatar.pipeline.torture.findings import none_of
+from avatar.pipeline.torture.formats import forge
+from avatar.pipeline.torture.mutators import MUTATORS
 from avatar.pipeline.torture.victims import peak_memory
 
 HANG_S = 10.0

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from avatar.methods.settings import RunConfig
 from avatar.records import CanonicalScan, Mesh, Motion, PointCloud
 from avatar.settings import settings_to_dict
-from avatar.training.runs import RunConfig
 
 
 def judge_mesh(mesh: Mesh) -> str:

@@ -11,12 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from avatar.environment import Finding
+from avatar.io.checkpoints import read_manifest
 from avatar.pipeline.torture.damage import digest, load_quietly
-from avatar.pipeline.torture.findings import Finding, all_of
+from avatar.pipeline.torture.findings import all_of
 from avatar.pipeline.torture.miniature import JOBS, SAVE_EVERY, STEPS, folder_of, prepare, train_job, weights_digest
 from avatar.pipeline.torture.victims import Victim, run_victim, wait_until, work_alone
 from avatar.training import cycles, implicit_loop, loop
-from avatar.training.checkpoints import read_manifest
 from avatar.training.logs import read_log
 
 DISK_CALLS = 6 * STEPS // SAVE_EVERY  # of a training's saves: two files each, flushed, renamed, their folder flushed

@@ -16,16 +16,11 @@ from avatar.data.outfits import SAMPLE_FOLDER
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
 from avatar.io.frames import write_manifest
-from avatar.pipeline.methods import train
-from avatar.training.canonicalizing import (
-    CanonicalizeConfig,
-    Skinning,
-    canonicalize_frames,
-    train_canonicalizer,
-)
-from avatar.training.cycles import CycleConfig
-from avatar.training.loop import TrainConfig
-from avatar.training.runs import MethodChoice, RunConfig
+from avatar.methods.canonicalizer import CanonicalizeConfig, CycleConfig
+from avatar.methods.settings import MethodChoice, RunConfig, TrainConfig
+from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
+from avatar.runs.training import train
+from avatar.training.canonicalizing import Skinning
 
 DATASET, OUTFIT = "open", "tee"
 STEPS, SAVE_EVERY = 24, 4

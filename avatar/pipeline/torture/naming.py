@@ -16,12 +16,15 @@ import numpy as np
 
 from avatar.checks import AvatarError
 from avatar.data.layouts import find_outfit
+from avatar.environment import Finding
+from avatar.io.checkpoints import load_checkpoint
 from avatar.io.frames import check_manifest
 from avatar.io.ledger import digest_of
+from avatar.methods.settings import RunConfig
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.scores import PredictConfig, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
-from avatar.pipeline.torture.findings import Finding, none_of
+from avatar.pipeline.torture.findings import none_of
 from avatar.pipeline.torture.miniature import (
     DATASET,
     OUTFIT,
@@ -32,10 +35,9 @@ from avatar.pipeline.torture.miniature import (
     train_job,
 )
 from avatar.pipeline.torture.victims import work_alone
+from avatar.runs.fitting import FitConfig
+from avatar.runs.training import save_settings
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.training.checkpoints import load_checkpoint
-from avatar.training.fitting import FitConfig
-from avatar.training.runs import RunConfig, save_settings
 
 STEMS = (
     "..", "../..", "../../..", "../up", "a/../../up", "/", "/tmp/up", "//up", "~", "~root", "~/up", ".", "./up", ".up",

@@ -10,7 +10,8 @@ import sys
 from pathlib import Path
 
 from avatar.checks import AvatarError
-from avatar.pipeline.torture.findings import Finding, all_of
+from avatar.environment import Finding
+from avatar.pipeline.torture.findings import all_of
 from avatar.pipeline.torture.payloads import TOOLS
 
 CALL = "import socket; socket.create_connection(('192.0.2.1', 80), 3)"  # an address of documentation

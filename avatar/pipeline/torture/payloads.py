@@ -22,13 +22,14 @@ import torch
 from avatar.body.convert import convert_body_model
 from avatar.checks import AvatarError
 from avatar.data.layouts import open_outfit_folder
-from avatar.io.meshes import read_mesh
+from avatar.environment import Finding
+from avatar.io.checkpoints import load_checkpoint, read_weights
+from avatar.io.meshes import FORMATS, read_mesh
 from avatar.io.motions import read_motion
-from avatar.pipeline.methods import load_avatar
-from avatar.pipeline.torture.findings import Finding, all_of, none_of
-from avatar.pipeline.torture.formats import FORMATS, smpl_arrays
+from avatar.pipeline.torture.findings import all_of, none_of
+from avatar.pipeline.torture.formats import smpl_arrays
 from avatar.pipeline.torture.victims import run_victim
-from avatar.training.checkpoints import load_checkpoint, read_weights
+from avatar.runs.loading import load_avatar
 
 TOOLS = Path(__file__).parents[3] / "tools"
 Payload = Callable[[Path, str], Callable[[], Any]]  # writes into a folder what would run a command; gives its loader

@@ -14,12 +14,13 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from avatar.pipeline.torture.findings import Finding, all_of, none_of
+from avatar.environment import Finding
+from avatar.io.checkpoints import named_tensors
+from avatar.pipeline.torture.findings import all_of, none_of
 from avatar.pipeline.torture.judges import bits
 from avatar.pipeline.torture.miniature import JOBS, STEPS, folder_of, prepare, train_job, weights_digest
 from avatar.pipeline.torture.victims import run_victim, work_alone
 from avatar.training import cycles, implicit_loop, loop
-from avatar.training.checkpoints import named_tensors
 
 PLACES = ("loss", "gradient", "scan point", "weight")
 TRAINERS = (loop.Trainer, implicit_loop.ImplicitTrainer, cycles.CycleTrainer)

@@ -7,7 +7,8 @@ from multiprocessing import get_context
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
-from avatar.pipeline.torture.findings import Finding, all_of
+from avatar.environment import Finding
+from avatar.pipeline.torture.findings import all_of
 from avatar.pipeline.torture.miniature import folder_of, prepare, train_job, weights_digest
 from avatar.pipeline.torture.victims import Victim, work_alone
 

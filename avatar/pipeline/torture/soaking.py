@@ -9,8 +9,10 @@ import threading
 import numpy as np
 
 from avatar.checks import AvatarError
-from avatar.export.meshing import PoissonConfig, PoissonMesher, check_mesh
-from avatar.pipeline.torture.findings import Finding, all_of, none_of
+from avatar.environment import Finding
+from avatar.export.meshing import PoissonConfig, PoissonMesher
+from avatar.io.meshes import check_mesh
+from avatar.pipeline.torture.findings import all_of, none_of
 from avatar.pipeline.torture.victims import resident_memory
 from avatar.records import PointCloud
 

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from avatar.environment import Finding
 from avatar.pipeline.torture.damage import digest, load_quietly
-from avatar.pipeline.torture.findings import Finding, all_of
+from avatar.pipeline.torture.findings import all_of
 from avatar.pipeline.torture.miniature import JOBS, SAVE_EVERY, folder_of, prepare, train_job, weights_digest
 from avatar.pipeline.torture.victims import run_victim, work_alone
 from avatar.training import cycles, implicit_loop, loop

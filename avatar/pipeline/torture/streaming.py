@@ -13,11 +13,11 @@ from avatar.data.open_layout import OpenOutfit
 from avatar.data.packed_layout import PackedOutfit, write_packed_frame
 from avatar.data.scanner import ScanConfig
 from avatar.data.streaming import bytes_of
+from avatar.environment import Finding
 from avatar.io.npz import write_whole
-from avatar.pipeline.methods import train
-from avatar.pipeline.torture.findings import Finding
 from avatar.pipeline.torture.miniature import run_config, write_data
 from avatar.pipeline.torture.victims import peak_memory, work_alone
+from avatar.runs.training import train
 
 SCAN_POINTS = 400_000
 LIMIT = 2 << 30  # bytes resident

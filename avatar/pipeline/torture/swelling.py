@@ -20,19 +20,20 @@ from scipy.sparse import csc_matrix
 from avatar.body.convert import convert_body_model
 from avatar.body.packed import packed_body
 from avatar.checks import AvatarError, require
+from avatar.environment import Finding
 from avatar.io.bvh import read_bvh
+from avatar.io.checkpoints import load_checkpoint, read_weights
 from avatar.io.documents import read_json, read_yaml
 from avatar.io.frames import read_open_frame
 from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_motion
 from avatar.io.npz import write_whole
 from avatar.io.points import read_points
-from avatar.pipeline.methods import load_avatar
-from avatar.pipeline.torture.findings import Finding, all_of
+from avatar.pipeline.torture.findings import all_of
 from avatar.pipeline.torture.formats import BVH, smpl_arrays
 from avatar.pipeline.torture.miniature import DECODER, folder_of, prepare, train_job
 from avatar.pipeline.torture.victims import peak_memory, run_victim, work_alone
-from avatar.training.checkpoints import load_checkpoint, read_weights
+from avatar.runs.loading import load_avatar
 
 MOST = 64  # MiB that a refusal may take
 HUGE = 1 << 33

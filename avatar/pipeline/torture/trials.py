@@ -13,13 +13,13 @@ from pathlib import Path
 import torch
 
 from avatar.checks import AvatarError, check_name
-from avatar.environment import prepared_process
+from avatar.environment import Finding, prepared_process
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.io.documents import read_json
 from avatar.io.npz import write_whole
 from avatar.pipeline.scores import current_commit
 from avatar.pipeline.torture.damage import flip_trial
-from avatar.pipeline.torture.findings import Finding, to_score, to_table
+from avatar.pipeline.torture.findings import to_score, to_table
 from avatar.pipeline.torture.fuzzing import fuzz_trial
 from avatar.pipeline.torture.killing import kill_trial
 from avatar.pipeline.torture.naming import name_trial

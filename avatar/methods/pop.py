@@ -13,9 +13,10 @@ from avatar.checks import AvatarError, check_shape
 from avatar.geometry.bags import pick
 from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions
-from avatar.nn.baselines.atlas import Atlas, uv_and_patch
-from avatar.nn.baselines.unet import UNet, UNetConfig
+from avatar.methods.points import PointMethod
+from avatar.nn.atlas import Atlas, uv_and_patch
 from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, bare_body
+from avatar.nn.unet import UNet, UNetConfig
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
 PLACE_CHANNELS = 4  # UV coordinates, and patch coordinates that are zero: POP's decoder has kept SCALE's input
@@ -68,7 +69,7 @@ class PopAvatar(nn.Module):
     atlas, so features jump where the atlas is cut, however near two points are on the body.
     """
 
-    outfit_modules = ("garment_encoder", "garment_decoder")  # see `distributed.share_norms`
+    outfit_modules = ("garment_encoder", "garment_decoder")  # see `distributed.synchronize_norms`
 
     def __init__(self, template: Template, outfits: int, config: PopConfig):
         """Builds the network on a body template with UV coordinates for a number of outfits."""
@@ -156,3 +157,11 @@ class PopAvatar(nn.Module):
         dressed = bare_body(self.skin_normals, samples, self.config.normals) + decoded
         points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
         return Decoded(points, normalize(dressed.normals, dim=-1))
+
+
+class Pop(PointMethod):
+    """POP, with CloSET's explicit template decomposition as a variant."""
+
+    name = "pop"
+    Settings = PopConfig
+    network = PopAvatar

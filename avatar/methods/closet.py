@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from avatar.canonical.fields import SkinningField, SkinningFieldConfig
 from avatar.checks import AvatarError, check_shape
+from avatar.data.outfits import Outfit
 from avatar.geometry.bags import pick
 from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
+from avatar.methods.base import CANONICALIZER, FitOptions, TrainedAvatar
+from avatar.methods.canonicalizer import canonicalizer_folder, load_canonicalizer
+from avatar.methods.points import PointMethod
+from avatar.methods.settings import RunConfig
 from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, bare_body
 from avatar.nn.encoders import Encoder, build_encoder
 from avatar.nn.locality import LocalPoseConfig, LocalPoseEncoder
 from avatar.nn.pointnet2 import PointNet2Config
 from avatar.nn.posing import LearnedSkinning
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
+from avatar.settings import settings_from_dict, settings_to_dict
 
 FULL_GARMENT_ENCODER = {
     "abstraction": (
@@ -89,7 +99,7 @@ class ClosetAvatar(nn.Module):
     see the pose, so it runs once an outfit in the batch, whatever the number of frames.
     """
 
-    outfit_modules = ("garment_encoder", "garment_decoder")  # see `distributed.share_norms`
+    outfit_modules = ("garment_encoder", "garment_decoder")  # see `distributed.synchronize_norms`
 
     def __init__(self, template: Template, outfits: int, config: ClosetConfig):
         """Builds the network on a body template for a number of outfits."""
@@ -214,3 +224,63 @@ class ClosetAvatar(nn.Module):
         dressed = bare_body(self.skin_normals, samples, self.config.normals) + self.garment_decoder(garment, places)
         points = places + dressed.offsets * self.config.offset_scale
         return Decoded(points, normalize(dressed.normals, dim=-1))
+
+
+class Closet(PointMethod):
+    """CloSET and its variants; ``skinning=learned`` takes the fields of the outfits' canonicalizers."""
+
+    name = "closet"
+    Settings = ClosetConfig
+    network = ClosetAvatar
+    static: ClassVar[Mapping[str, Any]] = {"pose": False}
+
+    def needs(self, run: RunConfig, settings: ClosetConfig) -> frozenset[str]:
+        learned = {CANONICALIZER} if settings.skinning is Skinning.learned else set()
+        return super().needs(run, settings) | learned
+
+    def build(self, run: RunConfig, settings: ClosetConfig, template: Template, outfits: list[Outfit]) -> ClosetAvatar:
+        model = super().build(run, settings, template, outfits)
+        if settings.skinning is Skinning.learned:
+            model.skin_with(learned_skinning(run.runs_root, outfits, run.canonical, settings.train_field))
+        return model
+
+    def describe(self, model: ClosetAvatar) -> dict[str, Any]:
+        if model.skinning is None:
+            return {}
+        return {"fields": [settings_to_dict(skin.config) for skin in model.skinning.fields]}
+
+    def rebuild(
+        self, settings: ClosetConfig, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping
+    ) -> ClosetAvatar:
+        model = super().rebuild(settings, template, outfits, facts, weights)
+        if settings.skinning is Skinning.learned:
+            model.skin_with(rebuild_skinning(facts["fields"], template))
+        return model
+
+    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
+        """As `PointMethod.fit_code`. Raises `AvatarError` with learned skinning, whose fields are the outfits' own."""
+        if avatar.settings.skinning is Skinning.learned:
+            raise AvatarError(
+                "run: learned skinning belongs to the outfits it was trained on. Hint: canonicalize and train the new "
+                "one, or fit a run with skinning=body."
+            )
+        return super().fit_code(avatar, batch, options)
+
+
+def learned_skinning(runs_root: Path, outfits: list[Outfit], name: str, trainable: bool) -> LearnedSkinning:
+    """Forward fields of the outfits' canonicalizers, ready to pose an avatar.
+
+    Raises:
+        DataError: when a canonicalizer is not there, or learned no field (weights=nearest, knn).
+    """
+    folders = [canonicalizer_folder(runs_root, outfit, name) for outfit in outfits]
+    fields = [load_canonicalizer(folder, "cpu").forward_field for folder in folders]
+    return LearnedSkinning(fields, [outfit.template for outfit in outfits], trainable)
+
+
+def rebuild_skinning(described: list[dict[str, Any]], template: Template) -> LearnedSkinning:
+    """Skinning of the described sizes on a body of the run's topology, its state still to be loaded."""
+    box = torch.tensor([[-1.0], [1.0]]).expand(2, 3)
+    configs = [settings_from_dict(SkinningFieldConfig, values, "fields.") for values in described]
+    fields = [SkinningField(len(template.parents), config, box) for config in configs]
+    return LearnedSkinning(fields, [template] * len(fields))

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from avatar.checks import AvatarError
-from avatar.training.checkpoints import restoring
+from avatar.io.checkpoints import restoring
 
 ROOM = 4  # times the numbers in a weights file: initialisation makes temporaries of a layer's size
 SPARE = 1 << 22  # numbers beside them, 16 MiB: what a network draws, sorts and caches of its template

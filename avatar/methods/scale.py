@@ -17,10 +17,11 @@ from avatar.geometry.sampling import farthest_points
 from avatar.geometry.surface import interpolate
 from avatar.geometry.transforms import transform_directions
 from avatar.geometry.uv import uv_barycentric
-from avatar.nn.baselines.atlas import Atlas, uv_and_patch
-from avatar.nn.baselines.unet import UNet, UNetConfig
+from avatar.methods.points import PointMethod
+from avatar.nn.atlas import Atlas, uv_and_patch
 from avatar.nn.decoders import DecoderConfig, Normals, ShapeDecoder
 from avatar.nn.pointnet2 import point_mlp
+from avatar.nn.unet import UNet, UNetConfig
 from avatar.nn.wide import WideLinear
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
@@ -198,3 +199,11 @@ class ScaleAvatar(nn.Module):
                 normals=normalize(transform_directions(frames, normals), dim=-1),
                 offsets=offsets,
             )
+
+
+class Scale(PointMethod):
+    """SCALE, of one outfit."""
+
+    name = "scale"
+    Settings = ScaleConfig
+    network = ScaleAvatar

@@ -1,0 +1,200 @@
+"""Interface of a method: how its network is built, trained, rebuilt from a file, and asked for a dressed surface.
+
+A method of any kind (points, implicit surface, mesh) is one file in this folder with a `Method` at its end. Trainer,
+prediction, meshing, evaluation and reports know this interface and no method by name.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+from torch import Tensor, nn
+
+from avatar.checks import AvatarError
+from avatar.implicit.extraction import ExtractionConfig
+from avatar.methods.losses import LossConfig
+from avatar.methods.settings import RunConfig
+from avatar.records import Batch, BodyFit, LossTerms, PointCloud, Surface, SurfaceSamples, Template
+
+Inputs = tuple[Any, ...]  # dataclasses of tensors; the first has the ``names`` of its frames
+CANONICALIZER = "canonicalizer"  # a method's need: a trained canonicalizer for each outfit
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Part of training with its own learning rates; it begins with a fresh optimiser state.
+
+    ``share`` of the budget; ``rates``, one for each of the task's parameter groups; ``factor(step, progress)`` on all
+    of them, at a step of the run and a share of the stage.
+    """
+
+    share: float
+    rates: tuple[float, ...]
+    factor: Callable[[int, float], float]
+
+
+@dataclass(frozen=True)
+class Position:
+    """Position in training: the ``stage``'s index and the share of it that is done, in [0, 1]."""
+
+    stage: int
+    progress: float
+
+
+class Task(ABC):
+    """What a `Trainer` trains: a network, the inputs of each step, and their loss. It keeps no state between steps.
+
+    ``model`` on its device; ``terms`` the raw loss terms, for the log; ``groups`` the parameter groups; ``stages``;
+    ``frames`` the number of training frames; ``batch`` frames a step; ``criterion``, the logged value that the best
+    checkpoint has the least of; ``label`` of the progress bar.
+    """
+
+    model: nn.Module
+    terms: tuple[str, ...]
+    groups: tuple[list[nn.Parameter], ...]
+    stages: tuple[Stage, ...]
+    frames: int
+    batch: int
+    criterion: str = ""
+    label: str = "train"
+
+    @abstractmethod
+    def inputs_at(self, step: int) -> Inputs:
+        """The inputs of a step on the CPU, this rank's shard; they follow from the step and the seed alone."""
+
+    @abstractmethod
+    def loss(self, inputs: Inputs, position: Position) -> LossTerms:
+        """Loss terms of inputs that are on the model's device."""
+
+    def held_back(self) -> Iterable[Inputs]:
+        """Inputs of the validation frames, always the same; none by default."""
+        return ()
+
+    def log_values(self, terms: LossTerms) -> dict[str, float]:
+        """The objective and every raw term, as the log shows them."""
+        raw = {name: float(value.detach()) for name, value in terms.raw.items()}
+        return {"loss": float(terms.total.detach())} | raw
+
+    def shown(self, values: dict[str, float]) -> dict[str, str]:
+        """What the progress bar shows of logged values, as text."""
+        return {"loss": f"{values['loss']:.3f}"}
+
+    def frame_names(self, inputs: Inputs) -> tuple[str, ...]:
+        """The names of the frames in a step's inputs."""
+        return inputs[0].names
+
+
+@dataclass(frozen=True)
+class TrainedAvatar:
+    """A trained network with its method, settings, the ``template`` it is built on, and ``steps`` and ``seconds``."""
+
+    method: Method
+    settings: Any
+    model: nn.Module
+    template: Template
+    config: RunConfig
+    steps: int
+    seconds: float
+
+    def outfit_index(self, name: str) -> int:
+        """Index of an outfit among those the avatar was trained on.
+
+        Raises:
+            AvatarError: for an outfit it was not trained on, naming those it was.
+        """
+        if name not in self.config.outfit:
+            raise AvatarError(f"outfit: this avatar was trained on {', '.join(self.config.outfit)}, not on {name!r}.")
+        return self.config.outfit.index(name)
+
+
+class FitOptions(Protocol):
+    """Options of fitting a garment code: Adam's steps and rate, template points and their seed, loss weights."""
+
+    steps: int
+    code_lr: float
+    points: int
+    seed: int
+    loss: LossConfig
+
+
+class Method(ABC):
+    """One method: a name, a settings class, and everything that depends on the kind of avatar it trains.
+
+    ``makes_meshes`` is True for a method with a surface of its own, which prediction writes beside the points;
+    ``on_body`` for one that predicts at chosen places of the body (`predict_at`); ``static`` are the settings of its
+    ablation without pose, the ``static`` floor, or None.
+    """
+
+    name: ClassVar[str]
+    Settings: ClassVar[type]
+    makes_meshes: ClassVar[bool] = False
+    on_body: ClassVar[bool] = False
+    static: ClassVar[Mapping[str, Any] | None] = None
+
+    def needs(self, run: RunConfig, settings: Any) -> frozenset[str]:
+        """What must be made of the outfits before training: any of {`CANONICALIZER`}."""
+        return frozenset()
+
+    @abstractmethod
+    def prepare(self, run: RunConfig, settings: Any, template: Template) -> Task:
+        """An untrained network with its data and loss, on the run's device.
+
+        Raises:
+            AvatarError: for a run that the method cannot train, such as several outfits where it takes one.
+        """
+
+    @abstractmethod
+    def untrained(self, settings: Any, template: Template) -> nn.Module:
+        """A network for one outfit, without data: to count its parameters."""
+
+    def describe(self, model: nn.Module) -> dict[str, Any]:
+        """Plain values, beside settings and template, that `rebuild` needs; they are written beside the weights."""
+        return {}
+
+    @abstractmethod
+    def rebuild(
+        self, settings: Any, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping[str, Tensor]
+    ) -> nn.Module:
+        """The network of a finished run, its weights still to be loaded."""
+
+    @abstractmethod
+    def predictor(
+        self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
+    ) -> Callable[[BodyFit], Surface]:
+        """A function that dresses posed bodies.
+
+        Args:
+            avatar: a trained avatar of this method.
+            outfit: one of those it was trained on.
+            points: points a frame, 1,000 to 400,000.
+            surface: resolution of an implicit surface.
+        """
+
+    def prediction_settings(self, points: int, surface: ExtractionConfig) -> dict[str, Any]:
+        """The options of `predictor` that this method's predictions depend on, as plain values."""
+        return {"points": points}
+
+    def predict_at(self, avatar: TrainedAvatar, outfit: str, body: BodyFit, samples: SurfaceSamples) -> PointCloud:
+        """The dressed surface at chosen places of the body (``on_body`` methods).
+
+        Raises:
+            AvatarError: for a method that has no points there.
+        """
+        raise AvatarError(f"method: {self.name} predicts no points at chosen places of the body.")
+
+    def garment(
+        self, avatar: TrainedAvatar, outfit: str, points: int, body: BodyFit | None = None
+    ) -> PointCloud | None:
+        """The explicit garment template, skinned to a body or in the canonical pose; None for a method without one."""
+        return None
+
+    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
+        """The garment code of an unseen outfit from one scan, for a method with one code an outfit.
+
+        Raises:
+            AvatarError: for a method without codes.
+        """
+        raise AvatarError(f"run: {self.name} has no garment code that could be fitted to another outfit.")

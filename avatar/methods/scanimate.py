@@ -1,0 +1,250 @@
+"""SCANimate: a pose-aware signed distance on T-pose scans, extracted and posed by learned skinning (CVPR 2021)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
+from avatar.checks import AvatarError, DataError
+from avatar.data.canonical_batches import CanonicalBatch, CanonicalFrame, CanonicalFrames, canonical_frame
+from avatar.data.mirroring import mirror_map
+from avatar.data.outfits import Outfit
+from avatar.data.splits import split_outfit
+from avatar.data.streaming import Streamed
+from avatar.environment import choose_device
+from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig, sample_mesh
+from avatar.implicit.body_field import BodyField
+from avatar.implicit.extraction import ExtractionConfig
+from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
+from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
+from avatar.io.documents import read_yaml
+from avatar.methods.base import CANONICALIZER, Inputs, Method, Position, Stage, Task, TrainedAvatar
+from avatar.methods.canonicalizer import (
+    CanonicalizeConfig,
+    Skinning,
+    canonical_outfits,
+    canonicalizer_folder,
+    load_canonicalizer,
+)
+from avatar.methods.points import check_count
+from avatar.methods.settings import Precision, RunConfig, TrainConfig
+from avatar.records import BodyFit, LossTerms, Surface, Template
+from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.world import require_single_process
+
+SEED_STRIDE = 1_000_003
+FIELD = "field."  # prefix of the forward field's weights among the avatar's
+BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that the box's sides are empty
+
+
+@dataclass
+class ImplicitTrainConfig:
+    """What training an implicit avatar has besides its budget (`TrainConfig`)."""
+
+    probes: ProbeConfig = field(default_factory=ProbeConfig)
+    loss: ImplicitLossConfig = field(default_factory=ImplicitLossConfig)
+    decay: float = 0.1  # factor on the learning rate, on top of train.schedule, at each of
+    decay_at: tuple[float, ...] = (0.5, 0.75)  # these shares of training (the paper's)
+
+    def __post_init__(self):
+        if not 0 < self.decay <= 1 or any(not 0 < share < 1 for share in self.decay_at):
+            raise AvatarError(
+                f"decay: expected above 0 and at most 1, decay_at: shares between 0 and 1, "
+                f"got {self.decay} and {self.decay_at}."
+            )
+
+    def rate_factor(self, progress: float) -> float:
+        """The learning rate's factor from the decays that are past at a share of training."""
+        return self.decay ** sum(progress >= share for share in self.decay_at)
+
+
+@dataclass
+class ScanimateConfig:
+    """Options of the `scanimate` method: ``method.settings`` of a run.
+
+    Of ``train`` the budget and the optimiser count (steps, minutes, batch, scan_points, lr, schedule, warmup, clip,
+    mirror, seed and how often to log, validate and save); template points and point losses have no part in it.
+    """
+
+    avatar: ImplicitConfig = field(default_factory=ImplicitConfig)
+    train: ImplicitTrainConfig = field(default_factory=ImplicitTrainConfig)
+
+
+class ImplicitTask(Task):
+    """Training of a signed distance: points on T-pose scans and in space, and a second-order loss (eqs. 14-17)."""
+
+    terms = TERMS
+    criterion = "surface"
+
+    def __init__(
+        self,
+        model: ImplicitAvatar,
+        body: Tensor,
+        config: TrainConfig,
+        settings: ImplicitTrainConfig,
+        frames: CanonicalFrames,
+        checks: CanonicalFrames | None = None,
+    ):
+        """Prepares training.
+
+        Args:
+            model: the avatar.
+            body: ``(V, 3)`` canonical body vertices, about which the field is sampled as well.
+            config: budget and optimiser.
+            settings: points in space, weights of the terms, decay of the learning rate.
+            frames: training frames; checks: held-back ones.
+        """
+        self.model, self.body, self.box = model, body, model.box.cpu()
+        self.config, self.settings, self.data, self.checks = config, settings, frames, checks
+        self.frames, self.batch = len(frames), config.batch
+        self.groups = ([parameter for parameter in model.parameters() if parameter.requires_grad],)
+        self.stages = (Stage(1.0, (config.lr,), self.rate_factor),)
+
+    def rate_factor(self, step: int, progress: float) -> float:
+        """The learning rate's factor: warm-up, the schedule's and the decays that are past."""
+        return self.config.rate_factor(step, progress) * self.settings.rate_factor(progress)
+
+    def inputs_at(self, step: int) -> tuple[CanonicalBatch, SpacePoints]:
+        """The batch of a step and its points in space."""
+        batch = self.data.batch_at(step, self.config.batch)
+        return batch, self.space_at(batch, step)
+
+    def held_back(self) -> Iterator[tuple[CanonicalBatch, SpacePoints]]:
+        """The held-back frames, always at the same points."""
+        for batch in self.checks.ordered() if self.checks else ():
+            yield batch, self.space_at(batch, -1)
+
+    def space_at(self, batch: CanonicalBatch, key: int) -> SpacePoints:
+        """The points in space that a key draws for a batch on the CPU."""
+        generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key + 1)
+        return space_points(batch.points, self.body, self.box, self.settings.probes, generator)
+
+    def loss(self, inputs: Inputs, position: Position) -> LossTerms:
+        """The field at a batch's points and at points in space, and its losses."""
+        batch, space = inputs
+        values = probe_field(self.model, batch.points, space, batch.joint_transforms)
+        return implicit_loss(values, batch.normals, self.settings.loss, batch.colors)
+
+    def shown(self, values: dict[str, float]) -> dict[str, str]:
+        """The objective and the mean distance on the scan, millimetres."""
+        return super().shown(values) | {"surface": f"{values['surface'] * 1e3:.1f}mm"}
+
+
+class Scanimate(Method):
+    """SCANimate's implicit avatar of one outfit, trained on its canonicalizer's T-pose scans."""
+
+    name = "scanimate"
+    Settings = ScanimateConfig
+    makes_meshes = True
+
+    def needs(self, run: RunConfig, settings: ScanimateConfig) -> frozenset[str]:
+        return frozenset({CANONICALIZER})
+
+    def prepare(self, run: RunConfig, settings: ScanimateConfig, template: Template) -> ImplicitTask:
+        """As `Method.prepare`. Raises `DataError` without canonical scans, naming the command that makes them."""
+        require_single_process(self.name)
+        train = run.train
+        if train.precision is not Precision.fp32:
+            raise AvatarError(f"train.precision: expected fp32 for {self.name}, got {train.precision.value}.")
+        if len(run.outfit) != 1:
+            raise AvatarError(f"outfit: {self.name} learns one outfit at a time, got {', '.join(run.outfit)}.")
+        outfits = run.outfits()
+        outfit = canonical_outfits(run.runs_root, outfits, run.canonical)[0]
+        skinning = find_field(canonicalizer_folder(run.runs_root, outfits[0], run.canonical), template)
+        split = split_outfit(outfit, run.split)
+        colored = settings.avatar.colored
+        seen, held_back = (read_frames(outfit, names, colored) for names in (split.train, split.validation))
+        corners = [torch.stack([frame.points.amin(dim=0), frame.points.amax(dim=0)]) for frame in seen]
+        box = bounding_box(torch.cat([*corners, template.vertices]), BOX_MARGIN)
+        torch.manual_seed(train.seed)
+        model = ImplicitAvatar(template, skinning, box, settings.avatar).to(choose_device(run.device))
+        symmetry = mirror_map(template) if train.mirror else None
+        frames = CanonicalFrames(seen, train.scan_points, train.seed, symmetry)
+        checks = CanonicalFrames(held_back, train.scan_points, train.seed) if held_back else None
+        return ImplicitTask(model, template.vertices, train, settings.train, frames, checks)
+
+    def untrained(self, settings: ScanimateConfig, template: Template) -> ImplicitAvatar:
+        box = torch.stack([template.vertices.amin(dim=0), template.vertices.amax(dim=0)])
+        return ImplicitAvatar(template, BodyField(template), box, settings.avatar)
+
+    def describe(self, model: ImplicitAvatar) -> dict[str, Any]:
+        return {"box": model.box.tolist(), "field": describe_field(model.field)}
+
+    def rebuild(
+        self, settings: ScanimateConfig, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping
+    ) -> ImplicitAvatar:
+        skinning = build_field(facts["field"], template, weights)
+        return ImplicitAvatar(template, skinning, torch.tensor(facts["box"]), settings.avatar)
+
+    def predictor(
+        self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
+    ) -> Callable[[BodyFit], Surface]:
+        """As `Method.predictor`: points spread over the posed surface, and that. Raises without a surface."""
+        check_count(points)
+        avatar.outfit_index(outfit)
+
+        def dress(body: BodyFit) -> Surface:
+            joint_transforms = torch.from_numpy(np.asarray(body.joint_transforms, np.float32))
+            mesh = avatar.model.posed_mesh(joint_transforms, surface)
+            return Surface(sample_mesh(mesh, points), mesh)
+
+        return dress
+
+    def prediction_settings(self, points: int, surface: ExtractionConfig) -> dict[str, Any]:
+        return super().prediction_settings(points, surface) | {"surface": settings_to_dict(surface)}
+
+
+def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequence[CanonicalFrame]:
+    """The canonical scans of training frames, with the poses they were taken in; read when they are needed.
+
+    Raises:
+        DataError: for a scan that is not there, or without colours where they are to be learned.
+    """
+
+    def read(index: int) -> CanonicalFrame:
+        frame = canonical_frame(outfit.load("train", names[index]))
+        if colored and frame.colors is None:
+            path = outfit.frame_path("train", frame.name)
+            raise DataError(path, "this scan has no colours to learn.", "Set method.settings.avatar.colored=false.")
+        return frame
+
+    return Streamed(read, len(names))
+
+
+def find_field(folder: Path, template: Template) -> nn.Module:
+    """The forward skinning field of a canonicalizer's run: the learned one, or the body's for its rivals.
+
+    Rivals (nearest, knn) learn no field. Both are posed by the six nearest body vertices, for with the nearest one
+    alone the posed surface would tear wherever the neighbour changes.
+    """
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise DataError(path, "no such file.", "Run tools/canonicalize.py to its end.")
+    if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is Skinning.learned:
+        return load_canonicalizer(folder, "cpu").forward_field
+    return BodyField(template)
+
+
+def describe_field(forward_field: nn.Module) -> dict[str, Any]:
+    """What `build_field` needs, beside the weights, to make a forward field again."""
+    if isinstance(forward_field, BodyField):
+        return {"neighbours": forward_field.neighbours}
+    return {"learned": settings_to_dict(forward_field.config)}
+
+
+def build_field(facts: dict[str, Any], template: Template, weights: dict[str, Tensor]) -> nn.Module:
+    """The forward field of a run's own facts and weights; the canonicalizer's folder is not looked at."""
+    if "neighbours" in facts:
+        return BodyField(template, facts["neighbours"])
+    settings = settings_from_dict(SkinningFieldConfig, facts["learned"])
+    forward_field = SkinningField(len(template.parents), settings, template.vertices[:2])
+    own = {name.removeprefix(FIELD): value for name, value in weights.items() if name.startswith(FIELD)}
+    forward_field.load_state_dict(own)
+    return forward_field

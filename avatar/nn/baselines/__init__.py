@@ -1,1 +1,0 @@
-"""The papers' rivals, one file a method, written from their papers."""

@@ -1,0 +1,1 @@
+"""Runs: folders with the settings, weights and predictions of one trained avatar or canonicalizer."""

@@ -1,0 +1,130 @@
+"""Predictions of a trained avatar on disk: points, and meshes where the method has them, of a split or a motion."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from avatar.checks import check_shape
+from avatar.data.outfits import Outfit
+from avatar.environment import prepared_process
+from avatar.implicit.extraction import ExtractionConfig
+from avatar.io.ledger import Ledger, digest_of, keyed
+from avatar.io.meshes import write_mesh
+from avatar.io.points import write_points
+from avatar.methods.base import TrainedAvatar
+from avatar.progress import tracked
+from avatar.records import BodyFit, Motion
+from avatar.settings import settings_to_dict
+
+SOURCE = ("avatar.runs.prediction",)  # what makes predictions, beside the method's own module
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One frame to predict: its name, a function that makes its body, and a hash of all that the body depends on."""
+
+    name: str
+    body: Callable[[], BodyFit]
+    digest: str
+
+
+@prepared_process()
+def predict_frames(
+    avatar: TrainedAvatar,
+    outfit: Outfit,
+    split: str,
+    folder: Path,
+    meshes: Path,
+    points: int,
+    surface: ExtractionConfig | None = None,
+    keep: Callable[[str], bool] = bool,
+) -> list[Path]:
+    """Writes ``<folder>/<frame>.ply`` for the frames of a split; gives the files in order.
+
+    Args:
+        avatar: a trained avatar.
+        outfit: one of the outfits it was trained on.
+        split: train, validation or test.
+        folder: where the point clouds go.
+        meshes: where ``<frame>.ply`` with the surface goes, for a method that has one.
+        points: points a frame, 1,000 to 400,000.
+        surface: resolution of an implicit surface.
+        keep: which frames, by name; all of them by default.
+    """
+    poses = [
+        Pose(name, lambda name=name: outfit.load(split, name).body, outfit.digest(split, name))
+        for name in outfit.frames(split)
+        if keep(name)
+    ]
+    return predict_poses(avatar, outfit.name, poses, folder, meshes, points, surface)
+
+
+@prepared_process()
+def predict_motion(
+    avatar: TrainedAvatar,
+    outfit: Outfit,
+    motion: Motion,
+    folder: Path,
+    meshes: Path,
+    points: int,
+    surface: ExtractionConfig | None = None,
+) -> list[Path]:
+    """Writes ``<folder>/<motion>.<frame>.ply`` for every frame of a motion; see `predict_frames`.
+
+    Points of a point method keep their order over time.
+    """
+    check_shape("poses", motion.poses, "T J 3", J=len(outfit.posable_body().parents))
+    poses = [
+        Pose(
+            f"{motion.name}.{frame:05d}",
+            lambda frame=frame: outfit.fit_pose(motion.poses[frame], motion.translations[frame]),
+            pose_digest(outfit, motion, frame),
+        )
+        for frame in range(len(motion.poses))
+    ]
+    return predict_poses(avatar, outfit.name, poses, folder, meshes, points, surface)
+
+
+def predict_poses(
+    avatar: TrainedAvatar,
+    outfit: str,
+    poses: Iterable[Pose],
+    folder: Path,
+    meshes: Path,
+    points: int,
+    surface: ExtractionConfig | None,
+) -> list[Path]:
+    """Writes the predictions of poses; those of the same avatar and bodies whose hashes are still right stay."""
+    surface = surface or ExtractionConfig()
+    dress = avatar.method.predictor(avatar, outfit, points, surface)
+    made = {"avatar": avatar_digest(avatar), **avatar.method.prediction_settings(points, surface)}
+    source = (*SOURCE, type(avatar.method).__module__)
+    written, done = [], Ledger(folder)
+    for pose in tracked(list(poses), f"predict {outfit}"):
+        path, key = folder / f"{pose.name}.ply", keyed(source, **made, body=pose.digest)
+        written.append(path)
+        if done.find(pose.name, key):
+            continue
+        dressed, files = dress(pose.body()), [path]
+        if dressed.mesh is not None:
+            files.append(meshes / f"{pose.name}.ply")
+            write_mesh(files[-1], dressed.mesh)
+        write_points(path, dressed.cloud)
+        done.record(pose.name, key, files)
+    return written
+
+
+def avatar_digest(avatar: TrainedAvatar) -> str:
+    """One hash over all that a trained avatar's predictions depend on: weights, template and settings."""
+    total = hashlib.sha256(digest_of(settings_to_dict(avatar.config.method)).encode())
+    for name, value in avatar.model.state_dict().items():
+        total.update(f"{name} {tuple(value.shape)}".encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return total.hexdigest()
+
+
+def pose_digest(outfit: Outfit, motion: Motion, frame: int) -> str:
+    """One hash over all that the body of a motion's frame depends on: pose, place, and the outfit's shared files."""
+    return digest_of([motion.poses[frame].tolist(), motion.translations[frame].tolist(), outfit.shared_digest])

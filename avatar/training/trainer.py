@@ -1,0 +1,263 @@
+"""The trainer of every method: stages, budget, bad steps, log, validation, checkpoints, stop signals and ranks."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from contextlib import nullcontext
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from avatar.checks import AvatarError
+from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
+from avatar.io.locks import lock_folder
+from avatar.methods.base import Inputs, Position, Task
+from avatar.nn.shared_norm import synchronize_norms
+from avatar.progress import Progress
+from avatar.records import LossTerms
+from avatar.training.feeding import Feed, to_device
+from avatar.training.logs import TrainingLog
+from avatar.training.signals import StopRequest, stop_requests
+from avatar.world import average, broadcast, current_world, gather, gradients_of
+
+FORMAT = 2  # of checkpoints; those of trainers before this one are refused
+MAX_BAD_STEPS = 10
+report = logging.getLogger(__name__)
+
+
+class Budget(Protocol):
+    """Settings of training that do not depend on the method; ``minutes``, if not None, may end it before ``steps``."""
+
+    steps: int
+    minutes: float | None
+    clip: float | None
+    validate_every: int
+    save_every: int
+    log_every: int
+    seed: int
+
+
+class Trainer:
+    """Trains a task in a run's folder; started again, it resumes from the newest valid checkpoint, equal to the bit."""
+
+    def __init__(self, task: Task, budget: Budget, folder: Path):
+        """Prepares training; under torchrun, as one rank of several.
+
+        Args:
+            task: the network, its inputs and its loss.
+            budget: steps or minutes, and how often to log, validate and save.
+            folder: the run's folder; ``metrics.csv`` and ``checkpoints/`` go there.
+        """
+        self.task, self.budget, self.folder, self.model = task, budget, folder, task.model
+        self.device = next(self.model.parameters()).device
+        self.world = current_world()
+        if self.world.size > 1:
+            synchronize_norms(self.model)
+        kept = self.model.state_dict().keys()
+        self.statistics = [buffer for name, buffer in self.model.named_buffers() if name in kept]
+        groups = [{"params": group, "lr": rate} for group, rate in zip(task.groups, task.stages[0].rates)]
+        self.optimiser = torch.optim.Adam(groups, fused=True)
+        self.step, self.seconds, self.stage, self.bad_steps = 0, 0.0, 0, 0
+
+    def fit(self) -> None:
+        """Trains until the budget is spent; holds the lock of the run's folder while it does.
+
+        Raises:
+            AvatarError: when losses or gradients stay non-finite, or another job holds the folder.
+            Stopped: after SIGTERM or SIGUSR1, with everything saved.
+        """
+        with lock_folder(self.folder) if self.world.is_main else nullcontext(), stop_requests() as stop:
+            self.resume()
+            columns = ["loss", *self.task.terms, "lr", "grad_norm"]
+            log = TrainingLog(self.folder, columns, self.step) if self.world.is_main else None
+            try:
+                self.run(log, stop)
+            finally:
+                if log:
+                    log.close()
+
+    def run(self, log: TrainingLog | None, stop: StopRequest) -> None:
+        """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
+        started, budget = time.monotonic() - self.seconds, self.budget
+        limit = 60 * budget.minutes if budget.minutes else None
+        bar = Progress(self.task.label, budget.steps, "step", self.step, limit, self.seconds, silent=log is None)
+        with bar, Feed(self.task.inputs_at, budget.steps, self.device) as feed:
+            while self.progress() < 1:
+                terms, rate, norm = self.train_step(feed(self.step))
+                self.step += 1
+                stopping = self.sync_clock(time.monotonic() - started, stop)
+                bar.advance()
+                done, score = self.progress() >= 1, None
+                if self.step % budget.log_every == 0 or done:
+                    values = self.world_mean(self.task.log_values(terms)) | {"lr": rate, "grad_norm": float(norm)}
+                    bar.show(**self.task.shown(values))
+                    self.write(log, "train", values)
+                if self.step % budget.validate_every == 0 or done:
+                    values = self.validate()
+                    score = values.get(self.task.criterion)
+                    self.write(log, "validation", values)
+                due = self.step % budget.save_every == 0 or score is not None
+                if (due and not self.bad_steps) or done or stopping:
+                    self.save(score)
+                if stopping and not done:
+                    stop.leave(self.folder)
+
+    def write(self, log: TrainingLog | None, split: str, values: dict[str, float]) -> None:
+        """Writes one row of the log, on the main rank and where there are values."""
+        if log and values:
+            epoch = self.step * self.task.batch // self.task.frames
+            log.write(split, self.step, epoch, self.seconds, values)
+
+    def sync_clock(self, seconds: float, stop: StopRequest) -> bool:
+        """Averages the elapsed time over all ranks; True if any rank received a stop signal."""
+        shared = torch.tensor([seconds, float(stop.number is not None)], dtype=torch.float64)
+        average([shared], self.world)
+        self.seconds = float(shared[0])
+        return bool(shared[1] > 0)
+
+    def world_mean(self, values: dict[str, float]) -> dict[str, float]:
+        """The mean of named values over all ranks."""
+        every = gather(values, self.world)
+        return {name: sum(each[name] for each in every) / len(every) for name in values}
+
+    def progress(self) -> float:
+        """Share of the budget that is spent, by steps or by the clock, whichever is further."""
+        return spent(self.budget, self.step, self.seconds)
+
+    def position(self) -> Position:
+        """The stage that the next step belongs to, and how far in it that is."""
+        progress, start = self.progress(), 0.0
+        stages = self.task.stages
+        for index, stage in enumerate(stages):
+            end = start + stage.share
+            if progress < end or index == len(stages) - 1:
+                return Position(index, min(1.0, round((progress - start) / (end - start), 12)))
+            start = end
+        raise AssertionError("expected at least one stage")
+
+    def train_step(self, inputs: Inputs) -> tuple[LossTerms, float, Tensor]:
+        """One optimiser step on inputs that are on the device; gives loss terms, learning rate and gradient norm.
+
+        A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were.
+        """
+        self.model.train()
+        position = self.position()
+        if position.stage != self.stage:
+            self.optimiser.state.clear()
+            self.stage = position.stage
+        stage = self.task.stages[position.stage]
+        factor = stage.factor(self.step, position.progress)
+        for group, rate in zip(self.optimiser.param_groups, stage.rates):
+            group["lr"] = rate * factor
+        before = [statistic.clone() for statistic in self.statistics]
+        terms = self.task.loss(inputs, position)
+        self.optimiser.zero_grad(set_to_none=True)
+        terms.total.backward()
+        total = terms.total.detach().clone()
+        if self.world.size > 1:
+            average([*gradients_of(self.model, self.world), total], self.world)
+        learned = [parameter for group in self.task.groups for parameter in group]
+        norm = nn.utils.clip_grad_norm_(learned, self.budget.clip or math.inf)
+        if bool(torch.isfinite(norm + total)):
+            self.optimiser.step()
+            self.bad_steps = 0
+        else:
+            self.reject_step(inputs, before)
+        return terms, stage.rates[0] * factor, norm
+
+    def reject_step(self, inputs: Inputs, statistics: list[Tensor]) -> None:
+        """Restores running statistics after a step that was not finite; ends training after too many in a row."""
+        for statistic, value in zip(self.statistics, statistics):
+            statistic.copy_(value)
+        self.bad_steps += 1
+        if self.bad_steps > MAX_BAD_STEPS:
+            raise AvatarError(
+                f"loss: not finite for {self.bad_steps} steps in a row (step {self.step}, frames "
+                f"{', '.join(self.task.frame_names(inputs))}). Hint: lower the learning rate or check these frames; "
+                "the last checkpoint is valid."
+            )
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Mean loss terms over held-back frames at the end of training's schedule; empty without frames."""
+        self.model.eval()
+        sums: dict[str, float] = {}
+        frames, end = 0, Position(len(self.task.stages) - 1, 1.0)
+        for inputs in islice(self.task.held_back(), self.world.rank, None, self.world.size):
+            count = len(self.task.frame_names(inputs))
+            terms = self.task.loss(to_device(inputs, self.device), end)
+            for name, value in self.task.log_values(terms).items():
+                sums[name] = sums.get(name, 0.0) + value * count
+            frames += count
+        every = gather((sums, frames), self.world)
+        frames = sum(count for _, count in every)
+        return {name: sum(each.get(name, 0.0) for each, _ in every) / frames for name in every[0][0]}
+
+    def save(self, score: float | None) -> None:
+        """Writes a checkpoint; the main rank does, with the random state of all."""
+        state = self.state()
+        if self.world.is_main:
+            save_checkpoint(self.folder / "checkpoints", state, self.step, score)
+
+    def state(self) -> dict[str, Any]:
+        """Everything a resumed run needs: tensors and plain values."""
+        random = {"cpu": torch.get_rng_state()}
+        if self.device.type == "cuda":
+            random["cuda"] = torch.cuda.get_rng_state(self.device)
+        return {
+            "format": FORMAT,
+            "model": self.model.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "step": self.step,
+            "stage": self.stage,
+            "seconds": self.seconds,
+            "random": gather(random, self.world),
+            "threads": torch.get_num_threads(),
+        }
+
+    def resume(self) -> None:
+        """Goes back to the newest valid checkpoint; seeds the random state when there is none.
+
+        Raises:
+            AvatarError: for a checkpoint of an earlier version's trainer.
+        """
+        world, folder = self.world, self.folder / "checkpoints"
+        state = broadcast(load_checkpoint(folder) if world.is_main else None, world)
+        torch.manual_seed(self.budget.seed + 1_000_003 * world.rank)
+        if state is None:
+            weights = {name: value.cpu() for name, value in self.model.state_dict().items()}
+            self.model.load_state_dict(broadcast(weights, world))
+            return
+        if state.get("format") != FORMAT:
+            raise AvatarError(
+                f"{folder}: expected a checkpoint of format {FORMAT}, got {state.get('format', 1)}, of an earlier "
+                "version. Hint: train it anew under another name (name=...); finished weights are still read."
+            )
+        with restoring(folder):
+            self.restore(state)
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Restores a checkpoint's state."""
+        world = self.world
+        self.model.load_state_dict(state["model"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.step, self.stage, self.seconds = int(state["step"]), int(state["stage"]), float(state["seconds"])
+        before = (state["threads"], len(state["random"]))
+        if before != (torch.get_num_threads(), world.size):
+            report.info("Resuming with other threads or processes than before: equal to rounding, not to the bit.")
+        if len(state["random"]) == world.size:
+            random = state["random"][world.rank]
+            torch.set_rng_state(random["cpu"])
+            if "cuda" in random and self.device.type == "cuda":
+                torch.cuda.set_rng_state(random["cuda"], self.device)
+
+
+def spent(budget: Budget, steps: int, seconds: float) -> float:
+    """Share of a budget that steps and seconds of training have used, by whichever is further."""
+    clock = seconds / (60 * budget.minutes) if budget.minutes else 0.0
+    return max(steps / budget.steps, clock)

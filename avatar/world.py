@@ -1,0 +1,131 @@
+"""Data-parallel processes under torchrun: ranks, shards of a batch, and the collectives that training needs.
+
+Gradients are averaged, the statistics of every normalisation are those of the whole batch (`nn.shared_norm`), and what
+is computed once an outfit is computed for all outfits of the step in every process; so a run gives the losses and
+gradients of one process with the same batch, to rounding (with noise on the input: in distribution). NCCL serves CUDA,
+gloo the CPU.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from avatar.checks import AvatarError
+
+
+@dataclass(frozen=True)
+class World:
+    """The processes of one run: ``rank`` is this one's number, ``size`` how many there are."""
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this is the process of rank 0, which writes files and messages."""
+        return self.rank == 0
+
+    def shard(self, batch: int) -> slice:
+        """The frames of a batch that this process trains on.
+
+        Raises:
+            AvatarError: when a batch cannot be divided evenly.
+        """
+        if batch % self.size:
+            raise AvatarError(f"batch: expected a multiple of the {self.size} processes, got {batch}.")
+        count = batch // self.size
+        return slice(self.rank * count, (self.rank + 1) * count)
+
+
+def current_world() -> World:
+    """The process group this process has joined; a single process without one."""
+    if dist.is_available() and dist.is_initialized():
+        return World(dist.get_rank(), dist.get_world_size())
+    return World()
+
+
+@contextmanager
+def torchrun_world() -> Iterator[World]:
+    """The process group that torchrun started, joined for the length of a ``with`` block; one process without it."""
+    if int(os.environ.get("WORLD_SIZE", "1")) < 2 or "LOCAL_RANK" not in os.environ:
+        yield World()
+        return
+    local, cuda = int(os.environ["LOCAL_RANK"]), torch.cuda.is_available()
+    if cuda:
+        if local >= torch.cuda.device_count():
+            raise AvatarError(f"--nproc-per-node: expected at most {torch.cuda.device_count()} here (CUDA devices).")
+        torch.cuda.set_device(local)
+    dist.init_process_group("cpu:gloo,cuda:nccl" if cuda else "gloo")
+    try:
+        yield current_world()
+    finally:
+        dist.destroy_process_group()
+
+
+def require_single_process(what: str) -> None:
+    """Check that torchrun started no other processes, for jobs that train in one.
+
+    Raises:
+        AvatarError: in every process where there are several.
+    """
+    if current_world().size > 1:
+        raise AvatarError(f"{what}: expected one process, got {current_world().size}. Hint: start it without torchrun.")
+
+
+def average(tensors: list[Tensor], world: World) -> None:
+    """Replaces tensors by their mean over all ranks, in one exchange; every process gets the same bits."""
+    if world.size == 1:
+        return
+    flat = torch.cat([tensor.flatten() for tensor in tensors])
+    dist.all_reduce(flat)
+    flat /= world.size
+    for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
+        tensor.copy_(mean.view_as(tensor))
+
+
+def step_outfits(outfit_ids: Tensor, outfits: int, world: World) -> Tensor:
+    """The outfits in any process's shard of a step, ascending: own frames' ``(B,)`` to the world's ``(O,)``."""
+    seen = torch.zeros(outfits)
+    seen[outfit_ids.cpu()] = 1
+    average([seen], world)
+    return seen.nonzero()[:, 0].to(outfit_ids.device)
+
+
+def gradients_of(model: nn.Module, world: World) -> list[Tensor]:
+    """The gradients of a model, zero where only other processes have one, so that all ranks have the same list.
+
+    Parameters without a gradient in every process (of a loss term that is off) keep none: Adam would count a step.
+    """
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    present = torch.tensor([float(parameter.grad is not None) for parameter in parameters])
+    average([present], world)
+    found = [parameter for parameter, share in zip(parameters, present.tolist()) if share > 0]
+    for parameter in found:
+        parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+    return [parameter.grad for parameter in found]
+
+
+def gather(value: Any, world: World) -> list[Any]:
+    """A plain value of every process, in the order of ranks; all processes get all."""
+    if world.size == 1:
+        return [value]
+    values: list[Any] = [None] * world.size
+    dist.all_gather_object(values, value)
+    return values
+
+
+def broadcast(value: Any, world: World) -> Any:
+    """The value of rank 0, in every process."""
+    if world.size == 1:
+        return value
+    values = [value]
+    dist.broadcast_object_list(values, src=0)
+    return values[0]
