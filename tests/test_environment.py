@@ -11,7 +11,6 @@ import pytest
 
 from avatar.environment import inspect_package, mending_line
 from avatar.invocation import interpreter
-from avatar.pipeline.torture.miniature import weights_digest, write_data
 from avatar.training.canonicalizing import canonicalize_frames, train_canonicalizer
 from avatar.training.fitting import fit_outfit
 from avatar.training.implicit_prediction import predict_implicit_frames, predict_implicit_motion
@@ -19,6 +18,7 @@ from avatar.training.implicit_runs import train_implicit
 from avatar.training.prediction import predict_frames, predict_motion
 from avatar.training.runs import train_run
 from avatar.verbs import VERBS, resolve
+from reliability.small_jobs import weights_digest, write_data
 
 ROOT = Path(__file__).parents[1]
 TWO_THREADS = {"OMP_NUM_THREADS": "2"}

@@ -3,4 +3,4 @@
 from start import run
 
 if __name__ == "__main__":
-    run("bench")
+    run("bench", "benchmarks:BENCH")

@@ -28,11 +28,11 @@ from avatar.pipeline.scores import (
     predict,
 )
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
-from avatar.pipeline.torture.miniature import folder_of, train_job
 from avatar.settings import settings_from_dict
 from avatar.training import prediction
 from avatar.training.checkpoints import save_checkpoint
 from avatar.training.runs import RunConfig, load_run
+from reliability.small_jobs import folder_of, train_job
 
 ROOT = Path(__file__).parents[2]
 METRICS = ["cd_point", "normal_l1"]
