@@ -1,4 +1,4 @@
-"""Says how fast it is: python tools/bench.py 'only=[chamfer,step]' repeats=5"""
+"""Measures speed and memory: python tools/bench.py 'only=[chamfer,step]' repeats=5"""
 
 from start import run
 

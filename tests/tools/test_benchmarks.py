@@ -1,4 +1,4 @@
-"""Benchmarks: references agree, ratios are sound, tables keep what is not run again. Never a time."""
+"""Benchmarks: results agree, ratios are valid, tables keep rows that are not measured again. No test asserts a time."""
 
 import math
 import time
@@ -11,9 +11,9 @@ from avatar.checks import AvatarError
 from avatar.config import CONF
 from avatar.evaluation.scores import read_scores
 from benchmarks.bench import BenchConfig, bench
+from benchmarks.comparisons import Comparison, Job, run_comparison
 from benchmarks.growth import ball, ball_batch
 from benchmarks.memory import peak_memory
-from benchmarks.races import Job, Race, run_race
 
 CONFIGS = {
     method: yaml.safe_load((CONF / "method_size" / f"{method}_small.yaml").read_text()) for method in ("closet", "pop")
@@ -30,30 +30,31 @@ def run_quick(out, *only: str, **options):
     return read_scores(out / "bench.csv").rows
 
 
-def hungry_races(job: Job) -> list[Race]:
-    """Two contenders that take 100 and 10 MiB for a moment."""
+def allocating_comparisons(job: Job) -> list[Comparison]:
+    """Two candidates that allocate 100 and 10 MiB for a moment."""
 
     def prepare(mebibytes: int):
         return lambda: float(torch.ones(mebibytes << 18).sum())
 
-    return [Race("hunger", "", {str(size): lambda size=size: prepare(size) for size in (100, 10)}, "10")]
+    return [Comparison("allocation", "", {str(size): lambda size=size: prepare(size) for size in (100, 10)}, "10")]
 
 
-def test_a_race_orders_its_contenders_and_tells_how_far_apart_results_are():
+def test_a_comparison_orders_its_candidates_and_gives_the_difference_of_results():
     def sleeper(seconds: float):
         return lambda: lambda: time.sleep(seconds) or seconds
 
-    race = Race("sleep", "", {"long": sleeper(0.05), "short": sleeper(0.01)}, "short", lambda mine, base: mine - base)
-    found = {(figure.contender, figure.metric): figure for figure in run_race(race, 3)}
+    candidates = {"long": sleeper(0.05), "short": sleeper(0.01)}
+    comparison = Comparison("sleep", "", candidates, "short", lambda mine, base: mine - base)
+    found = {(figure.candidate, figure.metric): figure for figure in run_comparison(comparison, 3)}
     assert found["short", "ratio"].value == 1 < found["long", "ratio"].value
     assert len(found["long", "seconds"].rounds) == 3
     assert found["long", "gap"].value == pytest.approx(0.04) and found["short", "gap"].value == 0
-    with pytest.raises(AvatarError, match="base"):
-        run_race(Race("sleep", "", {"long": sleeper(0)}, "short"), 1)
+    with pytest.raises(AvatarError, match="baseline"):
+        run_comparison(Comparison("sleep", "", {"long": sleeper(0)}, "short"), 1)
 
 
-def test_peak_memory_is_that_of_one_contender_in_its_own_process():
-    large, small = (peak_memory(hungry_races, JOB, 0, name) for name in ("100", "10"))
+def test_peak_memory_is_that_of_one_candidate_in_its_own_process():
+    large, small = (peak_memory(allocating_comparisons, JOB, 0, name) for name in ("100", "10"))
     assert 100 <= large < 120 and 10 <= small < 30
 
 

@@ -1,4 +1,4 @@
-"""Readers fed by hypothesis: whatever the bytes, a sound value or one error that names the file."""
+"""Property tests of the readers: for any bytes, a valid value or one error that names the file."""
 
 import random
 
@@ -11,7 +11,7 @@ from reliability.formats import FORMATS
 
 
 @st.composite
-def spoilt(draw, data: bytes) -> bytes:
+def mutated(draw, data: bytes) -> bytes:
     """Bytes with some of them changed, or a stretch replaced by another."""
     start = draw(st.integers(0, len(data)))
     stop = draw(st.integers(start, min(len(data), start + 64)))
@@ -28,21 +28,21 @@ def good(request, tmp_path_factory):
 @pytest.mark.filterwarnings("ignore")
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
-def test_a_spoilt_file_is_sound_or_refused_by_name(good, data):
-    kind, path, sound = good
-    path.write_bytes(data.draw(spoilt(sound)))
+def test_a_mutated_file_is_valid_or_refused_by_name(good, data):
+    kind, path, valid = good
+    path.write_bytes(data.draw(mutated(valid)))
     try:
         value = kind.read(path)
     except AvatarError as error:
         assert str(path.parent) in str(error)
     else:
-        assert kind.judge(value) == ""
+        assert kind.validate(value) == ""
 
 
-@pytest.mark.parametrize("name", [name for name, kind in FORMATS.items() if kind.respoil])
-def test_good_files_are_read_and_judged_sound(name, tmp_path):
+@pytest.mark.parametrize("name", [name for name, kind in FORMATS.items() if kind.mutate_values])
+def test_good_files_are_read_and_valid(name, tmp_path):
     kind = FORMATS[name]
     path = kind.make(tmp_path)
-    assert kind.judge(kind.read(path)) == ""
+    assert kind.validate(kind.read(path)) == ""
     data = path.read_bytes()
-    assert any(kind.respoil(data, random.Random(seed)) != data for seed in range(5))
+    assert any(kind.mutate_values(data, random.Random(seed)) != data for seed in range(5))

@@ -1,4 +1,4 @@
-"""Judges of what readers give, and trials' own checks: each finds a difference that was planted."""
+"""Validators of what readers return, and checks of the trials: each must detect a planted difference."""
 
 import copy
 from dataclasses import replace
@@ -12,31 +12,29 @@ import torch
 from avatar.data.batches import FrameDataset
 from avatar.records import CanonicalScan
 from avatar.training import loop
-from reliability import hostile_names as naming
-from reliability import killing
-from reliability import nan_injection as poisoning
+from reliability import hostile_names, killing, nan_injection
 from reliability.corruption import digest
-from reliability.formats import SHARED, cloud, judge_checkpoint, make_checkpoint, read_checkpoint
+from reliability.formats import SHARED, cloud, make_checkpoint, read_checkpoint, validate_checkpoint
 from reliability.hostile_names import try_names
 from reliability.killing import kill_trial
-from reliability.nan_injection import poison_trial
+from reliability.nan_injection import nan_trial
 from reliability.small_jobs import run_config
 from reliability.streaming import stream_trial
-from reliability.validators import judge_bvh, judge_config, judge_scan, judge_weights
-from reliability.workers import run_victim
+from reliability.validators import validate_bvh, validate_config, validate_scan, validate_weights
+from reliability.workers import run_worker
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    return tmp_path_factory.mktemp("torture")
+    return tmp_path_factory.mktemp("reliability")
 
 
 def unmet(findings):
     return [finding.what for finding in findings if not finding.met]
 
 
-def spoilt_states(state):
-    """A state with one of its values changed by as little as can be, for each of them."""
+def changed_states(state):
+    """A state with one of its values changed by the smallest amount, for each of them."""
 
     def visit(value, path):
         items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -57,40 +55,44 @@ def spoilt_states(state):
     return dict(visit(state, []))
 
 
-def test_a_checkpoint_is_judged_by_all_it_holds(tmp_path):
+def test_validation_of_a_checkpoint_compares_all_of_its_content(tmp_path):
     given = read_checkpoint(make_checkpoint(tmp_path))
-    assert judge_checkpoint(given) == ""
-    planted = spoilt_states(given)
+    assert validate_checkpoint(given) == ""
+    planted = changed_states(given)
     assert {"model/weight", "model/bias", "optimiser/state/0/exp_avg", "optimiser/param_groups/0/lr"} < planted.keys()
     assert {"random/0/cpu", "score"} < planted.keys()
     for name, state in planted.items():
-        assert name == "step" or "not what was saved" in judge_checkpoint(state), name
+        assert name == "step" or "not what was saved" in validate_checkpoint(state), name
         assert digest(state) != digest(given), name
     assert digest({**given, "seconds": 3.0}) == digest(given)
-    assert "not what was saved" in judge_checkpoint({**given, "more": 1})
-    assert "not what was saved" in judge_checkpoint({**given, "model": {"weight": given["model"]["weight"].double()}})
+    assert "not what was saved" in validate_checkpoint({**given, "more": 1})
+    assert "not what was saved" in validate_checkpoint(
+        {**given, "model": {"weight": given["model"]["weight"].double()}}
+    )
     given["optimiser"]["state"][0]["exp_avg"][3] = torch.nan
-    assert judge_checkpoint({**given, "step": 7}) == "not finite" and judge_checkpoint([given]) == "no state"
+    assert validate_checkpoint({**given, "step": 7}) == "not finite" and validate_checkpoint([given]) == "no state"
 
 
-def test_weights_scans_rotations_and_settings_are_judged_by_all_their_numbers():
-    assert judge_weights((SHARED, {}), SHARED) == ""
-    assert judge_weights(({"weight": SHARED["weight"] + 2**-18}, {}), SHARED)
+def test_validation_of_weights_scans_rotations_and_settings():
+    assert validate_weights((SHARED, {}), SHARED) == ""
+    assert validate_weights(({"weight": SHARED["weight"] + 2**-18}, {}), SHARED)
     points = cloud()
     scan = CanonicalScan(points.points, points.normals, np.ones((60, 1)), np.arange(60))
-    assert judge_scan(scan) == "" and judge_scan(replace(scan, normals=2 * scan.normals)) == "not finite or not unit"
+    assert (
+        validate_scan(scan) == "" and validate_scan(replace(scan, normals=2 * scan.normals)) == "not finite or not unit"
+    )
     motion = SimpleNamespace(positions=np.zeros((2, 3)), rotations=np.eye(3)[None].repeat(2, 0))
-    assert judge_bvh(motion) == ""
+    assert validate_bvh(motion) == ""
     motion.rotations[1, 0, 0] = -1  # a mirror
-    assert judge_bvh(motion) == "no rotations"
+    assert validate_bvh(motion) == "no rotations"
     config = run_config("closet", Path("root"))
-    assert judge_config(config) == ""
+    assert validate_config(config) == ""
     config.train.loss.offset = float("inf")
-    assert "loss" in judge_config(config)
+    assert "loss" in validate_config(config)
 
 
 class BesideTheRoots:
-    """A place for names by which a folder is made whose path begins like an allowed one's."""
+    """An entry point by which a folder is made whose path begins like an allowed one's."""
 
     def __init__(self, root):
         self.root = root
@@ -100,33 +102,33 @@ class BesideTheRoots:
 
 
 def test_a_folder_whose_name_begins_like_an_allowed_one_is_outside(tmp_path, monkeypatch):
-    monkeypatch.setattr(naming, "Doors", BesideTheRoots)
+    monkeypatch.setattr(hostile_names, "EntryPoints", BesideTheRoots)
     (tmp_path / "data").mkdir()
-    assert len(run_victim(try_names, tmp_path, ["x"]).value["outside"]) == 1
+    assert len(run_worker(try_names, tmp_path, ["x"]).value["outside"]) == 1
 
 
 @pytest.mark.slow
-def test_a_resumed_run_whose_optimiser_differs_is_found_out(root, monkeypatch):
+def test_a_resumed_run_whose_optimiser_differs_is_detected(root, monkeypatch):
     restore = loop.Trainer.restore
 
-    def careless(trainer, state):
+    def incomplete(trainer, state):
         restore(trainer, state)
-        trainer.optimiser.param_groups[1]["weight_decay"] = 1e-30  # no weight shows it
+        trainer.optimiser.param_groups[1]["weight_decay"] = 1e-30  # changes no weight
 
-    monkeypatch.setattr(loop.Trainer, "restore", careless)
+    monkeypatch.setattr(loop.Trainer, "restore", incomplete)
     monkeypatch.setattr(killing, "JOBS", ("closet",))
     assert unmet(kill_trial(root, 1, 1, seed=2)) == [
-        "last checkpoints equal to its, to the bit: model, optimiser, random state"
+        "last checkpoints equal to its, bit for bit: model, optimiser, random state"
     ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", ["no poison", "moments"])
-def test_a_trial_without_poison_and_a_step_that_spoils_moments_are_found_out(root, monkeypatch, fault):
-    monkeypatch.setattr(poisoning, "JOBS", ("closet",))
-    monkeypatch.setattr(poisoning, "PLACES", ("loss",))
-    if fault == "no poison":
-        monkeypatch.setattr(poisoning, "poison_functions", lambda *arguments: None)
+@pytest.mark.parametrize("fault", ["no injection", "moments"])
+def test_a_missing_injection_and_a_step_that_changes_moments_are_detected(root, monkeypatch, fault):
+    monkeypatch.setattr(nan_injection, "JOBS", ("closet",))
+    monkeypatch.setattr(nan_injection, "PLACES", ("loss",))
+    if fault == "no injection":
+        monkeypatch.setattr(nan_injection, "inject_into_functions", lambda *arguments: None)
     else:
         step = loop.Trainer.train_step
 
@@ -137,11 +139,11 @@ def test_a_trial_without_poison_and_a_step_that_spoils_moments_are_found_out(roo
             return result
 
         monkeypatch.setattr(loop.Trainer, "train_step", spoiling)
-    assert "poisoned steps that left all other weights as they were" in unmet(poison_trial(root, 2, seed=1))
+    assert "injected steps that left all other weights unchanged" in unmet(nan_trial(root, 2, seed=1))
 
 
 @pytest.mark.slow
-def test_a_stream_that_is_not_read_is_found_out(root, monkeypatch):
+def test_a_stream_that_is_not_read_is_detected(root, monkeypatch):
     batch_at = FrameDataset.batch_at
     monkeypatch.setattr(FrameDataset, "batch_at", lambda frames, step, size: batch_at(frames, 0, size))
     assert unmet(stream_trial(root, 0.3, 8)) == ["frames read while training"]

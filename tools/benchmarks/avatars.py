@@ -17,7 +17,7 @@ from avatar.records import Batch, Template
 from avatar.settings import settings_from_dict
 from avatar.training.loop import TrainConfig, Trainer
 from avatar.training.prediction import predict
-from benchmarks.races import Job, Race, Run
+from benchmarks.comparisons import Comparison, Job, Run
 
 EAGER = "compiling needs CUDA here: the main job never compiles, for it would need a C++ compiler on a bare machine"
 
@@ -56,8 +56,8 @@ def make_prediction(model: nn.Module, template: Template, batch: Batch, points: 
     return lambda: predict(model, batch, samples)
 
 
-def avatar_contenders(job: Job, make: Any, labels: list[str], points: int, frames: int, scan_points: int):
-    """Contenders by label and, on CUDA, their compiled variants; the reasons of those that are absent."""
+def avatar_candidates(job: Job, make: Any, labels: list[str], points: int, frames: int, scan_points: int):
+    """Candidates by label and, on CUDA, their compiled variants; the reasons of those that are absent."""
 
     def prepare(label: str, compiled: bool) -> Run:
         template, batch = sample_batch(frames, scan_points)
@@ -66,30 +66,30 @@ def avatar_contenders(job: Job, make: Any, labels: list[str], points: int, frame
             model.forward = torch.compile(model.forward)
         return make(model, template, batch.to(job.device), points)
 
-    contenders = {label: partial(prepare, label, False) for label in labels}
+    candidates = {label: partial(prepare, label, False) for label in labels}
     compiled = {f"{label} compiled": partial(prepare, label, True) for label in labels if label.startswith("closet")}
     if job.device == "cuda":
-        return contenders | compiled, {}
-    return contenders, dict.fromkeys(compiled, EAGER)
+        return candidates | compiled, {}
+    return candidates, dict.fromkeys(compiled, EAGER)
 
 
-def step_races(job: Job) -> list[Race]:
+def step_comparisons(job: Job) -> list[Comparison]:
     """Training steps: every avatar at 50,000 points, those of small size at 10,000."""
-    races, small = [], [label for label in job.labels if label.endswith("_small")]
-    for labels, base, points, scan_points in (
+    comparisons, small = [], [label for label in job.labels if label.endswith("_small")]
+    for labels, baseline, points, scan_points in (
         (job.labels, job.largest_pop, job.size(50_000, 400), job.size(40_000, 300)),
         (small, "pop_small", job.size(10_000, 300), job.size(10_000, 200)),
     ):
         frames = job.size(job.frames, 2)
-        contenders, absent = avatar_contenders(job, make_step, labels, points, frames, scan_points)
+        candidates, absent = avatar_candidates(job, make_step, labels, points, frames, scan_points)
         case = f"{points:,} points, {frames} frames"
-        if base in contenders:
-            races.append(Race("step", case, contenders, base, None, absent, points))
-    return races
+        if baseline in candidates:
+            comparisons.append(Comparison("step", case, candidates, baseline, None, absent, points))
+    return comparisons
 
 
-def predict_races(job: Job) -> list[Race]:
+def predict_comparisons(job: Job) -> list[Comparison]:
     """Predictions of one frame by every avatar."""
     points = job.size(50_000, 400)
-    contenders, absent = avatar_contenders(job, make_prediction, job.labels, points, 1, 1)
-    return [Race("predict", f"{points:,} points", contenders, job.largest_pop, None, absent, points)]
+    candidates, absent = avatar_candidates(job, make_prediction, job.labels, points, 1, 1)
+    return [Comparison("predict", f"{points:,} points", candidates, job.largest_pop, None, absent, points)]

@@ -1,4 +1,4 @@
-"""`bench`: how fast it is, as ratios of contenders run side by side, in a tidy CSV and as Markdown."""
+"""Benchmarks of speed and memory: ratios of candidates run side by side, as a tidy CSV and as Markdown."""
 
 from __future__ import annotations
 
@@ -20,26 +20,31 @@ from avatar.environment import choose_device, prepared_process
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.io.npz import write_whole
 from avatar.pipeline.scores import current_commit
-from benchmarks.avatars import predict_races, step_races
+from benchmarks.avatars import predict_comparisons, step_comparisons
 from benchmarks.ceilings import ceiling_figures
-from benchmarks.encoders import encoder_races
+from benchmarks.comparisons import Comparison, Figure, Job, run_comparison
+from benchmarks.encoders import encoder_comparisons
 from benchmarks.growth import growth_figures
 from benchmarks.memory import peak_memory
-from benchmarks.races import Figure, Job, Race, run_race
-from benchmarks.search import chamfer_races, nearest_races
-from benchmarks.surfaces import canonicalizer_races, extraction_races, poisson_races, simulation_races
+from benchmarks.search import chamfer_comparisons, nearest_comparisons
+from benchmarks.surfaces import (
+    canonicalizer_comparisons,
+    extraction_comparisons,
+    poisson_comparisons,
+    simulation_comparisons,
+)
 from benchmarks.tables import MACHINE, keep_others, to_markdown, to_scores
 
-RACES: dict[str, Callable[[Job], list[Race]]] = {
-    "nearest": nearest_races,
-    "chamfer": chamfer_races,
-    "pointnet2": encoder_races,
-    "step": step_races,
-    "predict": predict_races,
-    "canonicalizer": canonicalizer_races,
-    "extraction": extraction_races,
-    "poisson": poisson_races,
-    "simulation": simulation_races,
+COMPARISONS: dict[str, Callable[[Job], list[Comparison]]] = {
+    "nearest": nearest_comparisons,
+    "chamfer": chamfer_comparisons,
+    "pointnet2": encoder_comparisons,
+    "step": step_comparisons,
+    "predict": predict_comparisons,
+    "canonicalizer": canonicalizer_comparisons,
+    "extraction": extraction_comparisons,
+    "poisson": poisson_comparisons,
+    "simulation": simulation_comparisons,
 }
 OTHERS: dict[str, Callable[[Job, int], list[Figure]]] = {"growth": growth_figures, "ceilings": ceiling_figures}
 PACKAGES = ("torch", "numpy", "scipy", "open3d-cpu", "open3d", "newton")
@@ -49,13 +54,13 @@ report = logging.getLogger(__name__)
 
 @dataclass
 class BenchConfig:
-    """What is timed, how often and at which sizes; `conf/bench.yaml` adds the small networks."""
+    """Topics, repeats and sizes of the benchmarks; `bench.yaml` adds the small networks."""
 
     only: tuple[str, ...] = ()  # topics; empty for all
     repeats: int = 5  # rounds that a median is over
     quick: bool = False  # small sizes, for tests
-    frames: int = 4  # of a training step; four of full size take 18 GB while contenders share a process
-    memory: bool = True  # also each contender's peak memory, in a process of its own
+    frames: int = 4  # of a training step; four of full size take 18 GB while candidates share a process
+    memory: bool = True  # also each candidate's peak memory, in a process of its own
     avatars: dict[str, dict[str, Any]] = field(default_factory=lambda: {"closet_full": {}, "pop_full": {}})
     canonicalizers: dict[str, dict[str, Any]] = field(default_factory=lambda: {"full": {}})
     out: Path = Path("runs/tables")  # where the table's files go
@@ -63,9 +68,9 @@ class BenchConfig:
     device: str = "auto"
 
     def __post_init__(self):
-        unknown = [topic for topic in self.only if topic not in RACES | OTHERS]
+        unknown = [topic for topic in self.only if topic not in COMPARISONS | OTHERS]
         if unknown:
-            raise AvatarError(f"only: expected some of {', '.join(RACES | OTHERS)}, got {', '.join(unknown)}.")
+            raise AvatarError(f"only: expected some of {', '.join(COMPARISONS | OTHERS)}, got {', '.join(unknown)}.")
         if min(self.repeats, self.frames) < 1:
             raise AvatarError(f"repeats, frames: expected at least 1, got {self.repeats} and {self.frames}.")
         if not SAFE_NAME.fullmatch(self.table):
@@ -83,9 +88,9 @@ def bench(config: BenchConfig) -> Path:
     """
     job = Job(config.quick, choose_device(config.device).type, config.avatars, config.canonicalizers, config.frames)
     scores = machine_rows(config)
-    for topic in config.only or (*RACES, *OTHERS):
+    for topic in config.only or (*COMPARISONS, *OTHERS):
         load = Figure(topic, "", MACHINE, "load", os.getloadavg()[0], "1")
-        figures = run_races(topic, job, config) if topic in RACES else OTHERS[topic](job, config.repeats)
+        figures = run_comparisons(topic, job, config) if topic in COMPARISONS else OTHERS[topic](job, config.repeats)
         scores = scores + to_scores(config.table, [load, *figures], config.repeats, current_commit())
     path = config.out / f"{config.table}.csv"
     scores = keep_others(path, scores)
@@ -96,26 +101,31 @@ def bench(config: BenchConfig) -> Path:
     return path.with_suffix(".md")
 
 
-def run_races(topic: str, job: Job, config: BenchConfig) -> list[Figure]:
-    """A topic's races, after the memory of each contender in a process of its own; and who is absent."""
-    races = RACES[topic](job)
-    figures = memory_figures(RACES[topic], races, job) if config.memory else []
-    for race in races:
-        report.info("bench: %s, %s", race.topic, race.case)
-        figures += run_race(race, config.repeats) if race.contenders else []
-        figures += [Figure(race.topic, race.case, who, "absent", math.nan, why) for who, why in race.absent.items()]
+def run_comparisons(topic: str, job: Job, config: BenchConfig) -> list[Figure]:
+    """Figures of a topic: the memory of each candidate in a process of its own, its times, and missing candidates."""
+    comparisons = COMPARISONS[topic](job)
+    figures = memory_figures(COMPARISONS[topic], comparisons, job) if config.memory else []
+    for comparison in comparisons:
+        report.info("bench: %s, %s", comparison.topic, comparison.case)
+        figures += run_comparison(comparison, config.repeats) if comparison.candidates else []
+        figures += [
+            Figure(comparison.topic, comparison.case, who, "absent", math.nan, why)
+            for who, why in comparison.absent.items()
+        ]
     return figures
 
 
-def memory_figures(build: Callable[[Job], list[Race]], races: list[Race], job: Job) -> list[Figure]:
-    """Peak memory of every contender of a topic."""
+def memory_figures(build: Callable[[Job], list[Comparison]], comparisons: list[Comparison], job: Job) -> list[Figure]:
+    """Peak memory of every candidate of a topic."""
     figures = []
-    for place, race in enumerate(races):
-        for name in race.contenders:
-            report.info("bench: memory of %s, %s, %s", race.topic, race.case, name)
+    for place, comparison in enumerate(comparisons):
+        for name in comparison.candidates:
+            report.info("bench: memory of %s, %s, %s", comparison.topic, comparison.case, name)
             peak = peak_memory(build, job, place, name)
             if peak is not None:
-                figures.append(Figure(race.topic, race.case, name, "memory", peak, "MiB", race.points))
+                figures.append(
+                    Figure(comparison.topic, comparison.case, name, "memory", peak, "MiB", comparison.points)
+                )
     return figures
 
 
@@ -129,7 +139,7 @@ def describe_machine() -> dict[str, str]:
     waiting = ", ".join(f"{name}={os.environ[name]}" for name in WAITING if name in os.environ)
     facts = {
         "processor": f"{cpu}, {os.cpu_count()} cores",
-        "threads": f"{torch.get_num_threads()}, {waiting or 'idle ones as OpenMP likes'}",
+        "threads": f"{torch.get_num_threads()}, {waiting or 'default waiting of idle ones'}",
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "system": f"{platform.system()}, Python {platform.python_version()}",
     }
@@ -142,6 +152,6 @@ def describe_machine() -> dict[str, str]:
 
 
 def machine_rows(config: BenchConfig) -> Scores:
-    """What `describe_machine` says, as rows."""
+    """Rows with the facts of `describe_machine`."""
     facts = [Figure(MACHINE, text, name, "fact", 1.0, "1") for name, text in describe_machine().items()]
     return to_scores(config.table, facts, 0, current_commit())

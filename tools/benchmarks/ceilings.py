@@ -1,30 +1,32 @@
-"""How near the machine's measured ceilings the main job comes: products of matrices, and copies."""
+"""Ceilings of the machine, measured by matrix products and copies, and the share of them that training reaches."""
 
 from __future__ import annotations
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.avatars import step_races
-from benchmarks.races import Figure, Job, take_turns, time_once
+from benchmarks.avatars import step_comparisons
+from benchmarks.comparisons import Figure, Job, time_interleaved, time_once
 
 
 def ceiling_figures(job: Job, repeats: int) -> list[Figure]:
-    """The ceilings, and for every training step its multiplications and its share of the first ceiling.
+    """Ceilings, and for every training step its floating-point operations and its share of the first ceiling.
 
-    Multiplications are torch's count of matrix products and convolutions, forward and back; what else a step does
-    (normalisation, activations, neighbours) takes time and counts for nothing, so the share says how much of a step
-    is multiplying.
+    Operations are torch's count for matrix products and convolutions, forward and backward; the other work of a step
+    (normalisation, activations, neighbours) takes time and is not counted, so the share is that of multiplications.
     """
     side, length = job.size(2048, 64), job.size(1 << 26, 1 << 16)
     square, line = torch.rand(side, side, device=job.device), torch.rand(length, device=job.device)
     out = torch.empty_like(line)
-    race = step_races(job)[0]
+    comparison = step_comparisons(job)[0]
     products = {"matrix product": lambda: square @ square, "copy": lambda: out.copy_(line)}
-    take_turns(products, 1)
-    best = {name: min(job.cost(lap) for lap in laps) for name, laps in take_turns(products, repeats).items()}
+    time_interleaved(products, 1)
+    best = {
+        name: min(job.cost(timing) for timing in timings)
+        for name, timings in time_interleaved(products, repeats).items()
+    }
     flops = {}
-    for name, prepare in race.contenders.items():
+    for name, prepare in comparison.candidates.items():
         run = prepare()
         with FlopCounterMode(display=False) as counter:
             run()
@@ -37,7 +39,7 @@ def ceiling_figures(job: Job, repeats: int) -> list[Figure]:
     ]
     for name in flops:
         figures += [
-            Figure("ceilings", race.case, name, "work", flops[name] / 1e9, "Gflop", race.points),
-            Figure("ceilings", race.case, name, "share", flops[name] / best[name] / rate, "1", race.points),
+            Figure("ceilings", comparison.case, name, "work", flops[name] / 1e9, "Gflop", comparison.points),
+            Figure("ceilings", comparison.case, name, "share", flops[name] / best[name] / rate, "1", comparison.points),
         ]
     return figures

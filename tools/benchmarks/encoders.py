@@ -1,4 +1,4 @@
-"""PointNet++ without what makes it fast: the first layer on every neighbour, torch's gathers, nothing cached."""
+"""PointNet++ without its optimisations: the first layer on every neighbour, torch's gathers, no cached indices."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from avatar.nn.hierarchy import Level
 from avatar.nn.pointnet2 import FeaturePropagation, PointNet2, SetAbstraction
 from avatar.settings import settings_from_dict
 from benchmarks.avatars import sample_batch
-from benchmarks.races import Job, Race, Run
+from benchmarks.comparisons import Comparison, Job, Run
 
 
 class NeighbourAbstraction(SetAbstraction):
@@ -70,12 +70,12 @@ def slow_gathers(encoder: PointNet2) -> PointNet2:
     return slow
 
 
-def encoder_races(job: Job) -> list[Race]:
+def encoder_comparisons(job: Job) -> list[Comparison]:
     """The pose encoder forward and back, at full size over one frame, else over a batch.
 
     Indices anew are a network built for every step.
     """
-    races = []
+    comparisons = []
     for label in (name for name in job.labels if name.startswith("closet")):
         config = settings_from_dict(ClosetConfig, job.avatars[label], f"avatars.{label}.").pose_encoder
         frames = job.size(4, 1) if label.endswith("_small") else 1
@@ -99,10 +99,10 @@ def encoder_races(job: Job) -> list[Race]:
 
             return run
 
-        def gap(mine: Tensor, base: Tensor) -> float:
-            return float((mine - base).abs().max() / base.abs().max())
+        def gap(mine: Tensor, baseline: Tensor) -> float:
+            return float((mine - baseline).abs().max() / baseline.abs().max())
 
         kinds = ("ours", "layers a neighbour", "torch's gathers", "indices anew")
-        contenders = {kind: partial(prepare, kind) for kind in kinds}
-        races.append(Race("pointnet2", f"{label}, {frames} frames", contenders, "ours", gap))
-    return races
+        candidates = {kind: partial(prepare, kind) for kind in kinds}
+        comparisons.append(Comparison("pointnet2", f"{label}, {frames} frames", candidates, "ours", gap))
+    return comparisons

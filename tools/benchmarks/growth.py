@@ -1,4 +1,4 @@
-"""How the cost of a training step grows: an exponent each for points, vertices, outfits and frames."""
+"""Scaling exponents of a training step's cost with points, vertices, outfits and frames."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from avatar.checks import require
 from avatar.records import Batch, Template
 from benchmarks.avatars import make_avatar, make_step
-from benchmarks.races import Figure, Job, Run, take_turns
+from benchmarks.comparisons import Figure, Job, Run, time_interleaved
 
 LABEL = "closet_small"
 
@@ -25,7 +25,7 @@ def ball(subdivisions: int) -> Template:
 
 
 def ball_batch(template: Template, frames: int, outfits: int, scan_points: int) -> Batch:
-    """Frames of a sphere that stays as it is, in outfits by turns, with scans on it."""
+    """Batch of frames of a constant sphere, in alternating outfits, with scans on it."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(frames, scan_points, 3, generator=generator)
     scans = torch.nn.functional.normalize(directions, dim=-1)
@@ -43,16 +43,16 @@ def ball_batch(template: Template, frames: int, outfits: int, scan_points: int) 
 
 
 def prepare_step(job: Job, points: int, subdivisions: int, outfits: int, frames: int) -> tuple[Run, int]:
-    """A step of the small CloSET on a sphere; and the sphere's vertices."""
+    """Step of the small CloSET on a sphere, and the number of the sphere's vertices."""
     template = ball(subdivisions)
     batch = ball_batch(template, frames, outfits, points).to(job.device)
     return make_step(make_avatar(job, LABEL, template, outfits), template, batch, points), len(template.vertices)
 
 
 def growth_figures(job: Job, repeats: int) -> list[Figure]:
-    """Exponents of log processor seconds over log size, one size varied at a time; 1 is growth in proportion, 0 none.
+    """Exponents of log processor seconds over log size, one size varied at a time; 1 is linear, 0 constant.
 
-    Scan points go with the points. The sizes run in turns, as contenders of races do.
+    Scan points vary with the points. The sizes are timed in interleaved order, as candidates are.
     """
     usual = {"points": job.size(5000, 200), "subdivisions": job.size(5, 3), "outfits": 1, "frames": 4}
     varied = {
@@ -67,9 +67,12 @@ def growth_figures(job: Job, repeats: int) -> list[Figure]:
         if what == "subdivisions":
             what, sizes = "vertices", [vertices for _, vertices in prepared]
         runs = {str(size): run for size, (run, _) in zip(sizes, prepared)}
-        take_turns(runs, 1)
-        seconds = {name: median(job.cost(lap) for lap in laps) for name, laps in take_turns(runs, repeats).items()}
+        time_interleaved(runs, 1)
+        seconds = {
+            name: median(job.cost(timing) for timing in timings)
+            for name, timings in time_interleaved(runs, repeats).items()
+        }
         slope = np.polyfit(np.log(sizes), np.log(list(seconds.values())), 1)[0]
-        base = Figure("growth", f"{what} {sizes[0]:,} to {sizes[-1]:,}", LABEL, "exponent", float(slope), "1")
-        figures += [base, replace(base, metric="processor_seconds", value=seconds[str(sizes[-1])], unit="s")]
+        baseline = Figure("growth", f"{what} {sizes[0]:,} to {sizes[-1]:,}", LABEL, "exponent", float(slope), "1")
+        figures += [baseline, replace(baseline, metric="processor_seconds", value=seconds[str(sizes[-1])], unit="s")]
     return figures

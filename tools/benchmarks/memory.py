@@ -1,4 +1,4 @@
-"""Peak memory of a contender: measured in a process of its own, above what stood there before it ran."""
+"""Peak memory of a candidate, measured in a process of its own above its memory before the run."""
 
 from __future__ import annotations
 
@@ -12,40 +12,42 @@ import torch
 
 from avatar.environment import keep_freed_memory
 from avatar.processes import in_workers
-from benchmarks.races import Job, Race
+from benchmarks.comparisons import Comparison, Job
 
 STATUS = Path("/proc/self/status")
 
 
-def peak_memory(build: Callable[[Job], list[Race]], job: Job, race: int, contender: str) -> float | None:
-    """MiB that one contender's first run adds at its peak; None where the system does not tell.
+def peak_memory(build: Callable[[Job], list[Comparison]], job: Job, comparison: int, candidate: str) -> float | None:
+    """Peak memory that one candidate's first run adds, MiB; None where the system does not report it.
 
-    On CUDA of the device's memory, else of the process's resident memory; what its workers take is not counted.
+    Device memory on CUDA, else resident memory of the process; that of its worker processes is not counted.
 
     Args:
-        build: what makes the topic's races; a function of a module, for it runs in the new process.
-        job: what it is told.
-        race: which of its races.
-        contender: who runs.
+        build: function of a module that makes the topic's comparisons in the new process.
+        job: its argument.
+        comparison: index among its comparisons.
+        candidate: name of the candidate that runs.
     """
     if not STATUS.is_file():
         return None
     threads = torch.get_num_threads()
-    ((_, peak),) = in_workers(_measure, [(build, job, race, contender, threads)], workers=1)
+    ((_, peak),) = in_workers(_measure, [(build, job, comparison, candidate, threads)], workers=1)
     return peak
 
 
-def _measure(build: Callable[[Job], list[Race]], job: Job, race: int, contender: str, threads: int) -> float:
+def _measure(
+    build: Callable[[Job], list[Comparison]], job: Job, comparison: int, candidate: str, threads: int
+) -> float:
     torch.set_num_threads(threads)
     keep_freed_memory()  # as every verb has it
-    run = build(job)[race].contenders[contender]()
+    run = build(job)[comparison].candidates[candidate]()
     if job.device == "cuda":
         torch.cuda.reset_peak_memory_stats()
         before = torch.cuda.memory_allocated()
         run()
         return (torch.cuda.max_memory_allocated() - before) / 2**20
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)  # what preparing has freed would else be used again, and not be seen
+    ctypes.CDLL(None).malloc_trim(0)  # memory freed by the preparation would otherwise be reused, and not be counted
     Path(f"/proc/{os.getpid()}/clear_refs").write_text("5")  # the peak starts anew from what is resident now
     before = _kibibytes("VmRSS")
     run()

@@ -11,13 +11,13 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avatar.export.rival_search import open3d_nearest
 from avatar.geometry.bags import gather_rows
 from avatar.geometry.distances import correspond, normal_difference, point_to_point
 from avatar.geometry.neighbours import nearest
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from benchmarks.avatars import sample_outfit
-from benchmarks.races import Job, Race, absence
+from benchmarks.comparisons import Comparison, Job, absence
+from benchmarks.open3d_search import open3d_nearest
 
 Search = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -38,7 +38,7 @@ def dressed_clouds(job: Job, points: int, scan_points: int) -> tuple[Tensor, ...
 
 
 def scipy_nearest(queries: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """scipy's tree as it comes, on all threads."""
+    """KD-tree of scipy with its default options, on all threads."""
     return cKDTree(points).query(queries, workers=-1)[1]
 
 
@@ -51,22 +51,22 @@ def brute_nearest(queries: np.ndarray, points: np.ndarray) -> np.ndarray:
     ).numpy()
 
 
-def rivals(names: tuple[str, ...]) -> tuple[dict[str, Search], dict[str, str]]:
-    """The rivals there are among the named ones, and why the others are not."""
+def other_libraries(names: tuple[str, ...]) -> tuple[dict[str, Search], dict[str, str]]:
+    """Searches of the named libraries that are installed, and the reasons why others are missing."""
     known = {"brute force": brute_nearest, "scipy": scipy_nearest, "open3d": open3d_nearest}
     missing = {"open3d"} if find_spec("open3d") is None else set()
     there = {name: known[name] for name in names if name not in missing}
     return there, {name: absence(name) for name in names if name in missing}
 
 
-def nearest_races(job: Job) -> list[Race]:
+def nearest_comparisons(job: Job) -> list[Comparison]:
     """Template points to scan points; ours are trees on the CPU and exact brute force on CUDA."""
-    races = []
+    comparisons = []
     for points, scan_points, names in (
         (job.size(10_000, 500), job.size(8_000, 400), ("brute force", "scipy", "open3d")),
         (job.size(50_000, 800), job.size(40_000, 700), ("scipy", "open3d")),
     ):
-        found, absent = rivals(names)
+        found, absent = other_libraries(names)
         load = partial(dressed_clouds, job, points, scan_points)
 
         def ours(load=load):
@@ -77,20 +77,22 @@ def nearest_races(job: Job) -> list[Race]:
             cloud, _, scan, _ = (values[0].cpu().numpy() for values in load())
             return lambda: search(cloud, scan)
 
-        def gap(mine: np.ndarray, base: np.ndarray, load=load) -> float:
+        def gap(mine: np.ndarray, baseline: np.ndarray, load=load) -> float:
             cloud, _, scan, _ = (values[0].cpu().double().numpy() for values in load())
-            lengths = [np.linalg.norm(scan[ids] - cloud, axis=1) for ids in (mine, base)]
+            lengths = [np.linalg.norm(scan[ids] - cloud, axis=1) for ids in (mine, baseline)]
             return float(np.abs(lengths[0] - lengths[1]).max())
 
-        contenders = {"ours": ours} | {name: partial(theirs, search) for name, search in found.items()}
-        races.append(Race("nearest", f"{points:,} in {scan_points:,}", contenders, "ours", gap, absent, points))
-    return races
+        candidates = {"ours": ours} | {name: partial(theirs, search) for name, search in found.items()}
+        comparisons.append(
+            Comparison("nearest", f"{points:,} in {scan_points:,}", candidates, "ours", gap, absent, points)
+        )
+    return comparisons
 
 
-def chamfer_races(job: Job) -> list[Race]:
+def chamfer_comparisons(job: Job) -> list[Comparison]:
     """Both directions of the Chamfer distance and the normals' difference, as in training."""
     points, scan_points = job.size(50_000, 800), job.size(40_000, 700)
-    found, absent = rivals(("scipy", "open3d"))
+    found, absent = other_libraries(("scipy", "open3d"))
 
     def ours():
         cloud, normals, scan, scan_normals = dressed_clouds(job, points, scan_points)
@@ -115,8 +117,8 @@ def chamfer_races(job: Job) -> list[Race]:
 
         return run
 
-    def gap(mine: np.ndarray, base: np.ndarray) -> float:
-        return float(np.abs(mine / base - 1).max())
+    def gap(mine: np.ndarray, baseline: np.ndarray) -> float:
+        return float(np.abs(mine / baseline - 1).max())
 
-    contenders = {"ours": ours} | {name: partial(theirs, search) for name, search in found.items()}
-    return [Race("chamfer", f"{points:,} with {scan_points:,}", contenders, "ours", gap, absent, points)]
+    candidates = {"ours": ours} | {name: partial(theirs, search) for name, search in found.items()}
+    return [Comparison("chamfer", f"{points:,} with {scan_points:,}", candidates, "ours", gap, absent, points)]

@@ -1,4 +1,4 @@
-"""What stands beside the point avatars: the canonicalizer's step, surfaces from fields and points, simulated frames."""
+"""Benchmarks beside the point avatars: the canonicalizer's step, surfaces from fields and points, simulated frames."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from avatar.simulate.poses import draw_poses
 from avatar.simulate.production import dress
 from avatar.training.cycles import CycleConfig, CycleTrainer
 from benchmarks.avatars import sample_outfit
-from benchmarks.races import Job, Race, Run, absence
+from benchmarks.comparisons import Comparison, Job, Run, absence
 
 
-def canonicalizer_races(job: Job) -> list[Race]:
+def canonicalizer_comparisons(job: Job) -> list[Comparison]:
     """A step of the canonicalizer's two stages, at each size."""
     frames = job.size(4, 2)
 
@@ -43,15 +43,15 @@ def canonicalizer_races(job: Job) -> list[Race]:
         trainer.step = train.first_steps + 1 if together else 0
         return lambda: trainer.train_step(trainer.batch_at(trainer.step).to(job.device))
 
-    races = []
+    comparisons = []
     for label in (label for label in job.canonicalizers if label == "small" or not job.quick):
-        contenders = {"fields apart": partial(prepare, label, False), "together": partial(prepare, label, True)}
-        races.append(Race("canonicalizer", label, contenders, "fields apart"))
-    return races
+        candidates = {"fields apart": partial(prepare, label, False), "together": partial(prepare, label, True)}
+        comparisons.append(Comparison("canonicalizer", label, candidates, "fields apart"))
+    return comparisons
 
 
-def extraction_races(job: Job) -> list[Race]:
-    """The zero surface of a signed distance network asked coarse to fine, or everywhere."""
+def extraction_comparisons(job: Job) -> list[Comparison]:
+    """Zero surface of a signed distance network, evaluated coarse to fine or on the dense grid."""
     resolution, coarsest = job.size(128, 32), job.size(16, 8)
 
     def prepare(config: ExtractionConfig) -> Run:
@@ -65,22 +65,22 @@ def extraction_races(job: Job) -> list[Race]:
 
         return lambda: extract_surface(field, box, config).mesh
 
-    def gap(mine: Mesh, base: Mesh) -> float:
-        same = mine.vertices.shape == base.vertices.shape
-        return float(np.abs(mine.vertices - base.vertices).max()) if same else float("inf")
+    def gap(mine: Mesh, baseline: Mesh) -> float:
+        same = mine.vertices.shape == baseline.vertices.shape
+        return float(np.abs(mine.vertices - baseline.vertices).max()) if same else float("inf")
 
-    contenders = {
+    candidates = {
         "ours": partial(prepare, ExtractionConfig(resolution, coarsest)),
         "dense grid": partial(prepare, ExtractionConfig(resolution, resolution)),
     }
-    return [Race("extraction", f"{resolution} cells", contenders, "ours", gap)]
+    return [Comparison("extraction", f"{resolution} cells", candidates, "ours", gap)]
 
 
-def poisson_races(job: Job) -> list[Race]:
-    """Meshing a scan in the guarded worker, by octree depth; the worker's memory is not in the table."""
+def poisson_comparisons(job: Job) -> list[Comparison]:
+    """Meshing a scan in the worker process, by octree depth; the worker's memory is not in the table."""
     points, depths = job.size(40_000, 3000), job.size(8, 6)
     if find_spec("open3d") is None:
-        return [Race("poisson", f"{points:,} points", {}, "", absent={"depth 8": absence("open3d")})]
+        return [Comparison("poisson", f"{points:,} points", {}, "", absent={"depth 8": absence("open3d")})]
 
     def prepare(depth: int) -> Run:
         garment = sample_outfit()
@@ -90,14 +90,14 @@ def poisson_races(job: Job) -> list[Race]:
         mesher = PoissonMesher(PoissonConfig(depth=depth, max_hole=0.1))
         return lambda: mesher.mesh(cloud)
 
-    contenders = {f"depth {depth}": partial(prepare, depth) for depth in (depths - 1, depths)}
-    return [Race("poisson", f"{points:,} points", contenders, f"depth {depths}", points=points)]
+    candidates = {f"depth {depth}": partial(prepare, depth) for depth in (depths - 1, depths)}
+    return [Comparison("poisson", f"{points:,} points", candidates, f"depth {depths}", points=points)]
 
 
-def simulation_races(job: Job) -> list[Race]:
+def simulation_comparisons(job: Job) -> list[Comparison]:
     """A settled frame of the tee and of the dress, from the bind pose to rest."""
     if find_spec("newton") is None:
-        return [Race("simulation", "settled frame", {}, "", absent={"newton": absence("newton")})]
+        return [Comparison("simulation", "settled frame", {}, "", absent={"newton": absence("newton")})]
     travel = TravelConfig(stride=0.3, hold=3, least_hold=1) if job.quick else TravelConfig()
 
     def prepare(name: str) -> Run:
@@ -105,5 +105,5 @@ def simulation_races(job: Job) -> list[Race]:
         pose = draw_poses(1, 0, "train")[0].pose
         return lambda: dressed.settle(pose).cloth
 
-    contenders = {name: partial(prepare, name) for name in ("tee", "dress")}
-    return [Race("simulation", "settled frame", contenders, "tee")]
+    candidates = {name: partial(prepare, name) for name in ("tee", "dress")}
+    return [Comparison("simulation", "settled frame", candidates, "tee")]

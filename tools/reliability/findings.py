@@ -1,4 +1,4 @@
-"""What trials find: figures with the goal they must meet, as tidy rows and as the table of docs/reliability.md."""
+"""Findings of the trials: values and goals, as tidy rows and as the table of docs/reliability.md."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from avatar.evaluation.scores import Score
 
 @dataclass(frozen=True)
 class Finding:
-    """One figure of a trial, over ``cases`` cases; it must lie from ``low`` to ``high``, which are None where open."""
+    """A value measured by a trial over ``cases`` cases, and its goal: from ``low`` to ``high``, None where open."""
 
     trial: str
     what: str
@@ -36,12 +36,12 @@ class Finding:
 
 
 def all_of(trial: str, what: str, count: int, cases: int) -> Finding:
-    """A count that must be that of all cases."""
+    """A count whose goal is all cases."""
     return Finding(trial, what, count, f"of {cases}", cases, cases, cases)
 
 
 def none_of(trial: str, what: str, count: int, cases: int) -> Finding:
-    """A count that must be zero."""
+    """A count whose goal is zero."""
     return Finding(trial, what, count, f"of {cases}", cases, 0, 0)
 
 

@@ -1,4 +1,4 @@
-"""Every kind of file that is read: a good one of each, the reader, and an independent judge of what it gave."""
+"""File formats that are read: for each a valid file, the reader, and an independent validator of what was read."""
 
 from __future__ import annotations
 
@@ -31,38 +31,39 @@ from avatar.records import CanonicalScan, Mesh, Motion, PointCloud
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.checkpoints import load_checkpoint, read_weights, save_checkpoint, write_weights
 from avatar.training.runs import RunConfig
-from reliability.mutations import NUMBERS, spoil_array
+from reliability.mutations import NUMBERS, mutate_array
 from reliability.small_jobs import run_config
 from reliability.validators import (
-    judge_body,
-    judge_bvh,
-    judge_config,
-    judge_frame,
-    judge_garment,
-    judge_mesh,
-    judge_motion,
-    judge_points,
-    judge_scan,
-    judge_state,
-    judge_weights,
+    validate_body,
+    validate_bvh,
+    validate_config,
+    validate_frame,
+    validate_garment,
+    validate_mesh,
+    validate_motion,
+    validate_points,
+    validate_scan,
+    validate_state,
+    validate_weights,
 )
 
 SCORE = 0.5  # validation score of the checkpoints
-SHARED = {"weight": torch.arange(64.0)}  # weights to share
+SHARED = {"weight": torch.arange(64.0)}  # exported weights
 
 
 @dataclass(frozen=True)
 class Format:
-    """One kind of file.
+    """A file format.
 
-    ``make(folder)`` writes good ones and gives the file to spoil; ``read(path)`` reads; ``judge(value)`` says what is
-    unsound about what was read, or nothing; ``respoil(data, rng)`` spoils values inside the container.
+    ``make(folder)`` writes valid files and returns the one to mutate; ``read(path)`` reads it; ``validate(value)``
+    returns what is invalid about the value read, or nothing; ``mutate_values(data, rng)`` mutates values inside the
+    container.
     """
 
     make: Callable[[Path], Path]
     read: Callable[[Path], Any]
-    judge: Callable[[Any], str]
-    respoil: Callable[[bytes, random.Random], bytes] | None = None
+    validate: Callable[[Any], str]
+    mutate_values: Callable[[bytes, random.Random], bytes] | None = None
 
 
 def ball(count: int = 40) -> Mesh:
@@ -89,7 +90,7 @@ def mesh_format(suffix: str) -> Format:
         write_mesh(folder / f"mesh{suffix}", ball())
         return folder / f"mesh{suffix}"
 
-    return Format(make, read_mesh, judge_mesh)
+    return Format(make, read_mesh, validate_mesh)
 
 
 def make_ascii_mesh(folder: Path) -> Path:
@@ -153,20 +154,20 @@ def convert(path: Path) -> Any:
     return smpl_body(path.with_name("converted.npz"))
 
 
-def respoil_pickle(data: bytes, rng: random.Random) -> bytes:
-    """Another pickle of the same model, one of its arrays spoilt."""
+def mutate_pickle(data: bytes, rng: random.Random) -> bytes:
+    """Pickle of the same model, one of its arrays mutated."""
     arrays: dict[str, Any] = smpl_arrays()
     key = rng.choice(list(arrays))
-    arrays[key] = spoil_array(arrays[key], rng)
+    arrays[key] = mutate_array(arrays[key], rng)
     return pickle.dumps(arrays, protocol=rng.choice((0, 2, 4, 5)))
 
 
-def respoil_arrays(data: bytes, rng: random.Random) -> bytes:
-    """Another npz, one of its arrays spoilt, under a right checksum."""
+def mutate_arrays(data: bytes, rng: random.Random) -> bytes:
+    """Npz with one of its arrays mutated and valid checksums."""
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         arrays = dict(stored)
     key = rng.choice(list(arrays))
-    arrays[key] = spoil_array(arrays[key], rng)
+    arrays[key] = mutate_array(arrays[key], rng)
     packed = io.BytesIO()
     np.savez(packed, **arrays)
     return packed.getvalue()
@@ -274,26 +275,26 @@ def states() -> list[dict[str, Any]]:
     return [state(step) for step in (1, 2)]
 
 
-def judge_checkpoint(state: Any) -> str:
-    """A state that a folder gave, against the two that were saved there."""
-    return judge_state(state, [{**saved, "score": SCORE} for saved in states()])
+def validate_checkpoint(state: Any) -> str:
+    """Validation of a loaded state against the two that were saved."""
+    return validate_state(state, [{**saved, "score": SCORE} for saved in states()])
 
 
 def make_checkpoint(folder: Path) -> Path:
-    """Two checkpoints; the newer is given."""
+    """Two checkpoints; returns the newer."""
     return [save_checkpoint(folder / "checkpoints", state, state["step"], SCORE) for state in states()][-1]
 
 
 def read_checkpoint(path: Path) -> Any:
-    """What the folder of a checkpoint gives."""
+    """State that a checkpoint's folder loads."""
     return load_checkpoint(path.parent)
 
 
-def respoil_checkpoint(data: bytes, rng: random.Random) -> bytes:
-    """A state of other content and step, packed by torch; `fuzzing` gives the file the name that its hash asks for."""
+def mutate_checkpoint(data: bytes, rng: random.Random) -> bytes:
+    """Checkpoint of other content and step, packed by torch; `replace_content` names it by its hash."""
     state: Any = {**states()[1], "step": rng.choice((3, -1, None, "2", 1e30)), "score": SCORE}
-    spoilt = rng.choice((state["model"]["weight"], state["optimiser"]["state"][0]["exp_avg"]))
-    spoilt[rng.randrange(64)] = rng.choice((float("nan"), float("inf"), 3.0))
+    mutated = rng.choice((state["model"]["weight"], state["optimiser"]["state"][0]["exp_avg"]))
+    mutated[rng.randrange(64)] = rng.choice((float("nan"), float("inf"), 3.0))
     state = rng.choice((state, [state], {"model": 3}, {}, {**state, "score": "low"}))
     packed = io.BytesIO()
     torch.save(state, packed)
@@ -301,22 +302,22 @@ def respoil_checkpoint(data: bytes, rng: random.Random) -> bytes:
 
 
 def make_weights(folder: Path) -> Path:
-    """Weights to share, with their description."""
+    """Exported weights, with their description."""
     write_weights(folder / "avatar", SHARED, {"steps": 3})
     return folder / "avatar.safetensors"
 
 
 def read_shared(path: Path) -> Any:
-    """Weights to share, as whoever loads a run reads them."""
+    """Exported weights, as loading a run reads them."""
     return read_weights(path.with_suffix(""))
 
 
-def respoil_weights(data: bytes, rng: random.Random) -> bytes:
-    """Weights with a number that is none; `fuzzing` describes them with their right hash."""
-    spoilt = bytearray(data)
-    place = len(spoilt) - 4 * rng.randint(1, 60)
-    spoilt[place : place + 4] = rng.choice((b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\xff\xff\xff\xff"))
-    return bytes(spoilt)
+def mutate_weights(data: bytes, rng: random.Random) -> bytes:
+    """Weights with a NaN or infinity; `replace_content` describes them with their hash."""
+    mutated = bytearray(data)
+    place = len(mutated) - 4 * rng.randint(1, 60)
+    mutated[place : place + 4] = rng.choice((b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f", b"\xff\xff\xff\xff"))
+    return bytes(mutated)
 
 
 def make_config(folder: Path) -> Path:
@@ -327,11 +328,11 @@ def make_config(folder: Path) -> Path:
 
 
 def read_config(path: Path) -> Any:
-    """A run's settings, as `save_settings` and `load_run` take them."""
+    """Settings of a run, as `save_settings` and `load_run` take them."""
     return settings_from_dict(RunConfig, read_yaml(path), f"{path}: ")
 
 
-def respoil_config(data: bytes, rng: random.Random) -> bytes:
+def mutate_config(data: bytes, rng: random.Random) -> bytes:
     """Settings with one value of another kind or out of range."""
     values = yaml.safe_load(data)
     at = values
@@ -340,14 +341,14 @@ def respoil_config(data: bytes, rng: random.Random) -> bytes:
         if not isinstance(at[key], dict) or not at[key] or rng.random() < 0.1:
             break
         at = at[key]
-    weird: list[Any] = ["../../etc", "/etc/passwd", "x" * 300, [], {}, [[[]]], None, True, -1, 0, 10**40]
-    weird += [float("nan"), float("inf"), {"_target_": "os.system", "_args_": ["id"]}]
-    at[key] = rng.choice([*weird, *(number.decode() for number in NUMBERS)])
+    wrong: list[Any] = ["../../etc", "/etc/passwd", "x" * 300, [], {}, [[[]]], None, True, -1, 0, 10**40]
+    wrong += [float("nan"), float("inf"), {"_target_": "os.system", "_args_": ["id"]}]
+    at[key] = rng.choice([*wrong, *(number.decode() for number in NUMBERS)])
     return yaml.safe_dump(values, sort_keys=False).encode()
 
 
-def forge(path: Path, data: bytes) -> Path:
-    """Puts spoilt data in a file's place together with the hash that vouches for them; gives where they are."""
+def replace_content(path: Path, data: bytes) -> Path:
+    """Writes mutated data in place of a file, with the hash that matches them; returns their path."""
     digest = hashlib.sha256(data).hexdigest()
     if path.suffix == ".pt":
         for old in path.parent.iterdir():
@@ -360,24 +361,24 @@ def forge(path: Path, data: bytes) -> Path:
 
 
 FORMATS = {
-    "ply points": Format(make_points, read_points, judge_points),
-    "ply points, text": Format(make_ascii_points, read_points, judge_points),
+    "ply points": Format(make_points, read_points, validate_points),
+    "ply points, text": Format(make_ascii_points, read_points, validate_points),
     "ply mesh": mesh_format(".ply"),
-    "ply mesh, text": Format(make_ascii_mesh, read_mesh, judge_mesh),
+    "ply mesh, text": Format(make_ascii_mesh, read_mesh, validate_mesh),
     "obj": mesh_format(".obj"),
     "glb": mesh_format(".glb"),
     "stl": mesh_format(".stl"),
     "off": mesh_format(".off"),
-    "body npz": Format(make_template, packed_body, judge_body, respoil_arrays),
-    "frame npz": Format(copied("tee", "train"), read_open_frame, judge_frame, respoil_arrays),
-    "garment npz": Format(copied("tee", "garment.npz"), read_open_garment, judge_garment, respoil_arrays),
-    "motion npz": Format(make_motion, read_motion, judge_motion, respoil_arrays),
-    "AMASS npz": Format(make_amass, read_motion, judge_motion, respoil_arrays),
-    "canonical scan npz": Format(make_canonical_scan, read_canonical_scan, judge_scan, respoil_arrays),
-    "SMPL pkl": Format(make_model(".pkl"), convert, judge_body, respoil_pickle),
-    "SMPL npz": Format(make_model(".npz"), convert, judge_body, respoil_arrays),
-    "BVH": Format(make_bvh, read_bvh, judge_bvh),
-    "checkpoint": Format(make_checkpoint, read_checkpoint, judge_checkpoint, respoil_checkpoint),
-    "safetensors": Format(make_weights, read_shared, lambda read: judge_weights(read, SHARED), respoil_weights),
-    "config yaml": Format(make_config, read_config, judge_config, respoil_config),
+    "body npz": Format(make_template, packed_body, validate_body, mutate_arrays),
+    "frame npz": Format(copied("tee", "train"), read_open_frame, validate_frame, mutate_arrays),
+    "garment npz": Format(copied("tee", "garment.npz"), read_open_garment, validate_garment, mutate_arrays),
+    "motion npz": Format(make_motion, read_motion, validate_motion, mutate_arrays),
+    "AMASS npz": Format(make_amass, read_motion, validate_motion, mutate_arrays),
+    "canonical scan npz": Format(make_canonical_scan, read_canonical_scan, validate_scan, mutate_arrays),
+    "SMPL pkl": Format(make_model(".pkl"), convert, validate_body, mutate_pickle),
+    "SMPL npz": Format(make_model(".npz"), convert, validate_body, mutate_arrays),
+    "BVH": Format(make_bvh, read_bvh, validate_bvh),
+    "checkpoint": Format(make_checkpoint, read_checkpoint, validate_checkpoint, mutate_checkpoint),
+    "safetensors": Format(make_weights, read_shared, lambda read: validate_weights(read, SHARED), mutate_weights),
+    "config yaml": Format(make_config, read_config, validate_config, mutate_config),
 }

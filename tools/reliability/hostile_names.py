@@ -1,4 +1,4 @@
-"""`names`: hostile names in every place a name can stand; nothing may be written outside the data and run roots."""
+"""`names`: hostile file names at every entry point; nothing may be written outside the data and run roots."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from reliability.small_jobs import (
     run_config,
     train_job,
 )
-from reliability.workers import work_alone
+from reliability.workers import call_in_process
 
 STEMS = (
     "..", "../..", "../../..", "../up", "a/../../up", "/", "/tmp/up", "//up", "~", "~root", "~/up", ".", "./up", ".up",
@@ -49,7 +49,7 @@ WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
 def hostile_names(count: int, seed: int) -> list[str]:
-    """Names that climb, are absolute, hidden, empty, too long, links, of other systems or other alphabets."""
+    """Names with path traversal, absolute, hidden, empty, too long, links, of other systems or other alphabets."""
     rng, names = random.Random(seed), list(STEMS)
     while len(names) < count:
         names.append("".join(rng.choice(PARTS) for _ in range(rng.randint(2, 9))))
@@ -57,47 +57,47 @@ def hostile_names(count: int, seed: int) -> list[str]:
 
 
 def name_trial(root: Path, count: int, seed: int) -> list[Finding]:
-    """Gives every name to every door, in a process whose every write is heard by the interpreter's own audit hook."""
-    work_alone(prepare, root)
-    work_alone(train_job, "closet", root, "named")
+    """Gives every name to every entry point, in a process whose writes the interpreter's audit hook records."""
+    call_in_process(prepare, root)
+    call_in_process(train_job, "closet", root, "named")
     names = hostile_names(count, seed)
-    found = work_alone(try_names, root, names, timeout=3600)
+    found = call_in_process(try_names, root, names, timeout=3600)
     (root / "names.json").write_text(json.dumps(found, indent=1))
     outside, untyped = (len(found[key]) for key in ("outside", "untyped"))
     return [
         none_of("names", "names by which anything was written outside the roots", outside, count),
-        none_of("names", "that ended in another error than ours", untyped, count),
-        Finding("names", "doors that each was given to", len(Doors(root).all()), "doors", count),
+        none_of("names", "names that ended in an untyped error", untyped, count),
+        Finding("names", "entry points that each was given to", len(EntryPoints(root).all()), "entry points", count),
     ]
 
 
 def try_names(root: Path, names: list[str]) -> dict[str, list[str]]:
-    """The names by which something was written outside ``data`` and ``runs`` below the root, and those that crashed."""
+    """Names by which something was written outside ``data`` and ``runs`` below the root, and those that crashed."""
     allowed = [(root / part).resolve() for part in ("data", "runs")]
     written: list[str] = []
     (root / "data" / "link").unlink(missing_ok=True)
     (root / "data" / "link").symlink_to("/tmp")
-    for door in Doors(root).all():  # what libraries write when they are first loaded has nothing to do with names
+    for entry_point in EntryPoints(root).all():  # what libraries write as they are first loaded is not counted
         with suppress(AvatarError):
-            door("harmless")
+            entry_point("harmless")
     sys.addaudithook(lambda event, arguments: written.extend(places_written(event, arguments)))
     outside, untyped = [], []
     for name in names:
         written.clear()
-        for door in Doors(root).all():
+        for entry_point in EntryPoints(root).all():
             try:
-                door(name)
+                entry_point(name)
             except AvatarError:
                 continue
             except Exception as error:
                 untyped.append(f"{name!r} {error!r:.300}")
-        strays = [path for path in written if not any(Path(os.path.realpath(path)).is_relative_to(a) for a in allowed)]
-        outside += [f"{name!r} {strays[:3]}"] if strays else []
+        stray = [path for path in written if not any(Path(os.path.realpath(path)).is_relative_to(a) for a in allowed)]
+        outside += [f"{name!r} {stray[:3]}"] if stray else []
     return {"outside": outside, "untyped": untyped}
 
 
 def places_written(event: str, arguments: tuple[Any, ...]) -> list[str]:
-    """Paths that an audit event is about to write to, make, rename or remove."""
+    """Paths that an audit event writes to, makes, renames or removes."""
     if event == "open":
         path, mode, flags = arguments
         writes = bool(flags & WRITING) if isinstance(flags, int) else bool(set(str(mode)) & set("wax+"))
@@ -109,15 +109,15 @@ def places_written(event: str, arguments: tuple[Any, ...]) -> list[str]:
     return []
 
 
-class Doors:
-    """Where a name can come in: settings, files of others, and the names inside them."""
+class EntryPoints:
+    """Entry points of names: settings, untrusted files, and the names inside them."""
 
     def __init__(self, root: Path):
         self.root, self.run = root, folder_of("closet", root, "named")
         self.plain = settings_to_dict(run_config("closet", root))
 
     def all(self) -> list[Callable[[str], Any]]:
-        """Every door, as a function of the name."""
+        """Entry points as functions of the name."""
         root, save = self.root, self.save_run
         return [
             lambda name: save(name=name),
@@ -133,19 +133,19 @@ class Doors:
             lambda name: mesh(MeshConfig(run=self.run, predictions=name)),
             lambda name: ExportConfig(run=self.run, predictions=name),
             lambda name: CompareConfig(table=name),
-            self.forge_run,
+            self.write_run,
             self.name_motion,
             self.list_checkpoint,
             self.list_data,
         ]
 
     def save_run(self, **changes: Any) -> None:
-        """A run's settings, written to the folder they name."""
+        """Settings of a run, written to the folder they name."""
         save_settings(settings_from_dict(RunConfig, self.plain | changes))
 
-    def forge_run(self, name: str) -> None:
-        """A run from elsewhere whose description gives its outfit, its run and its data set this name."""
-        folder = self.root / "runs" / "forged"
+    def write_run(self, name: str) -> None:
+        """An untrusted run whose description gives its outfit, its run and its data set this name."""
+        folder = self.root / "runs" / "untrusted"
         shutil.copytree(self.run, folder, dirs_exist_ok=True)
         description = json.loads((self.run / "avatar.json").read_text())
         for change in ({"outfit": [name]}, {"name": name}, {"dataset": name}):
@@ -161,7 +161,7 @@ class Doors:
         predict(PredictConfig(run=self.run, motion=path, points=1000, device="cpu"))
 
     def list_checkpoint(self, name: str) -> None:
-        """A checkpoint that the manifest says is elsewhere, under a right seal."""
+        """A checkpoint that a manifest with a valid hash says is elsewhere."""
         folder = self.root / "runs" / "listed"
         folder.mkdir(exist_ok=True)
         entries = {"last": [{"file": name, "step": 1, "score": None, "sha256": "0" * 64}]}

@@ -1,4 +1,4 @@
-"""Five ways to spoil a file: its bits, bytes, pieces, numbers in digits, and the values in a sound container."""
+"""Mutations of files: bits, bytes, pieces, numbers in digits, and values inside a valid container."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ EXTREMES = (np.nan, np.inf, -np.inf, 1e30, -1e30, 1e-45, 0.0, -1.0, 2**31, -(2**
 
 
 def flip_bits(data: bytes, rng: random.Random) -> bytes:
-    """One to eight bits the other way round."""
-    spoilt = bytearray(data)
+    """Flips of one to eight bits."""
+    mutated = bytearray(data)
     for _ in range(rng.randint(1, 8)):
-        spoilt[rng.randrange(len(spoilt))] ^= 1 << rng.randrange(8)
-    return bytes(spoilt)
+        mutated[rng.randrange(len(mutated))] ^= 1 << rng.randrange(8)
+    return bytes(mutated)
 
 
 def set_bytes(data: bytes, rng: random.Random) -> bytes:
-    """One to eight bytes, or words of four, of the header or anywhere, set to what overflows."""
-    spoilt, reach = bytearray(data), rng.choice((len(data), min(len(data), 400)))
+    """Extreme values in one to eight bytes, or words of four, of the header or anywhere."""
+    mutated, reach = bytearray(data), rng.choice((len(data), min(len(data), 400)))
     for _ in range(rng.randint(1, 8)):
         word = rng.choice((*WORDS, bytes([rng.randrange(256)])))
         place = rng.randrange(reach)
-        spoilt[place : place + len(word)] = word
-    return bytes(spoilt)
+        mutated[place : place + len(word)] = word
+    return bytes(mutated)
 
 
 def cut_and_splice(data: bytes, rng: random.Random) -> bytes:
-    """A piece cut out, doubled, put elsewhere, or the end cut off."""
+    """Removal, duplication or move of a piece, or truncation."""
     start = rng.randrange(len(data))
     length = rng.choice((rng.randint(1, 64), rng.randint(1, len(data))))
     piece, rest = data[start : start + length], data[:start] + data[start + length :]
@@ -42,7 +42,7 @@ def cut_and_splice(data: bytes, rng: random.Random) -> bytes:
 
 
 def set_numbers(data: bytes, rng: random.Random) -> bytes:
-    """One to four of the numbers written in digits set to what no writer would write; bytes where there are none."""
+    """Extreme values for one to four of the numbers in digits; bytes where there are none."""
     found = list(re.finditer(rb"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?", data))
     if not found:
         return set_bytes(data, rng)
@@ -51,17 +51,17 @@ def set_numbers(data: bytes, rng: random.Random) -> bytes:
     return data
 
 
-def spoil_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
-    """An array with some entries extreme, fewer or more rows, another type, or other axes."""
+def mutate_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
+    """Array with some entries extreme, fewer or more rows, another type, or other axes."""
     kind = rng.randrange(5)
     if array.dtype.kind not in "biuf" or not array.size:
         return np.array([["x" * rng.randint(0, 80)]] if kind else rng.choice(("../../x", "", "\0", "nan")))
     if kind < 2:
         with np.errstate(all="ignore"):
-            spoilt = array.astype(np.float64) if kind and array.dtype.kind == "f" else array.copy()
+            mutated = array.astype(np.float64) if kind and array.dtype.kind == "f" else array.copy()
             for _ in range(rng.randint(1, 4)):
-                spoilt.flat[rng.randrange(spoilt.size)] = np.array(rng.choice(EXTREMES)).astype(spoilt.dtype)
-        return spoilt
+                mutated.flat[rng.randrange(mutated.size)] = np.array(rng.choice(EXTREMES)).astype(mutated.dtype)
+        return mutated
     if kind == 2:
         return array[: rng.randint(0, len(array))] if array.ndim else array[None]
     if kind == 3:
@@ -76,4 +76,4 @@ MUTATORS: dict[str, Callable[[bytes, random.Random], bytes]] = {
     "pieces": cut_and_splice,
     "numbers": set_numbers,
 }
-INSIDE = "values"  # the fifth: `formats.Format.respoil` unpacks, spoils and packs again, with right checksums
+INSIDE = "values"  # the fifth: `formats.Format.mutate_values` unpacks, mutates and packs again, with valid checksums

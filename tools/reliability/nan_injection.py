@@ -1,4 +1,4 @@
-"""`poison`: numbers that are none in losses, gradients, scans and weights; none may reach the disk."""
+"""`nan`: NaN and infinity injected into losses, gradients, scans and weights; none may reach the disk."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from avatar.training.checkpoints import named_tensors
 from reliability.findings import Finding, all_of, none_of
 from reliability.small_jobs import JOBS, STEPS, folder_of, prepare, train_job, weights_digest
 from reliability.validators import bits
-from reliability.workers import run_victim, work_alone
+from reliability.workers import call_in_process, run_worker
 
 PLACES = ("loss", "gradient", "scan point", "weight")
 TRAINERS = (loop.Trainer, implicit_loop.ImplicitTrainer, cycles.CycleTrainer)
@@ -30,41 +30,41 @@ LOSSES = (
 )
 
 
-def poison_trial(root: Path, poisons: int, seed: int) -> list[Finding]:
-    """Poisons miniature trainings of all four kinds, in four places, at one step or from there on."""
-    work_alone(prepare, root)
-    whole = {}
+def nan_trial(root: Path, injections: int, seed: int) -> list[Finding]:
+    """Injects NaN or infinity into small trainings of all four kinds, in four places, at one step or from it on."""
+    call_in_process(prepare, root)
+    expected = {}
     for job in JOBS:
-        work_alone(train_job, job, root, "whole")
-        whole[job] = weights_digest(folder_of(job, root, "whole"))
+        call_in_process(train_job, job, root, "uninterrupted")
+        expected[job] = weights_digest(folder_of(job, root, "uninterrupted"))
     rng = random.Random(seed)
     cases = list(product(JOBS, PLACES, (False, True)))  # the last: once, or from then on
-    caught = ended = written = equal = lasting = 0
-    for number in range(poisons):
+    contained = ended = written = equal = stopped = 0
+    for number in range(injections):
         job, place, once = cases[number % len(cases)]
-        name, folder = f"poisoned-{number}", folder_of(job, root, f"poisoned-{number}")
-        outcome = run_victim(train_poisoned, job, root, name, place, once, rng.randrange(2, STEPS - 12))
-        given, spread = (root / f"{name}.{what}" for what in ("given", "spread"))
-        caught += given.exists() and not spread.exists()
+        name, folder = f"nan-{number}", folder_of(job, root, f"nan-{number}")
+        outcome = run_worker(train_with_nan, job, root, name, place, once, rng.randrange(2, STEPS - 12))
+        injected, spread = (root / f"{name}.{what}" for what in ("injected", "spread"))
+        contained += injected.exists() and not spread.exists()
         ended += outcome.code in (0, 2)
         written += not all_finite(folder)
         if outcome.code == 2:
-            lasting += 1
-            run_victim(train_job, job, root, name)
-            equal += weights_digest(folder) == whole[job]
+            stopped += 1
+            run_worker(train_job, job, root, name)
+            equal += weights_digest(folder) == expected[job]
     return [
-        all_of("poison", "poisoned steps that left all other weights as they were", caught, poisons),
-        all_of("poison", "trainings that went on or ended with a named error", ended, poisons),
-        none_of("poison", "runs with a number on disk that is none", written, poisons),
-        all_of("poison", "of those that ended, finished from the last checkpoint as if unpoisoned", equal, lasting),
+        all_of("nan", "injected steps that left all other weights unchanged", contained, injections),
+        all_of("nan", "trainings that continued or ended with a typed error", ended, injections),
+        none_of("nan", "runs with a NaN or infinity on disk", written, injections),
+        all_of("nan", "of those that ended, resumed to the uninterrupted run's weights", equal, stopped),
     ]
 
 
-def train_poisoned(job: str, root: Path, name: str, place: str, once: bool, step: int) -> None:
-    """Trains with poison in one place at a step, or from it on.
+def train_with_nan(job: str, root: Path, name: str, place: str, once: bool, step: int) -> None:
+    """Trains with NaN or infinity injected in one place at a step, or from it on.
 
-    Leaves ``<root>/<name>.given`` where a step was poisoned: its loss or gradients were not finite; and
-    ``<root>/<name>.spread`` where such a step changed a weight, a statistic or a moment.
+    Writes ``<root>/<name>.injected`` where a step's loss or gradients were not finite, and ``<root>/<name>.spread``
+    where such a step changed a weight, a statistic or a moment.
     """
     state = {"step": -1, "trainer": None}
 
@@ -78,13 +78,13 @@ def train_poisoned(job: str, root: Path, name: str, place: str, once: bool, step
                 largest = max((p for p in trainer.model.parameters() if p.requires_grad), key=Tensor.numel)
                 largest.data.view(-1)[0] = math.nan  # a small one, such as a frame's code, is in few batches
             if place == "scan point" and due() and batch:
-                batch = (poison_points(batch[0]),)
-            before = bits(held_by(trainer)) if due() else {}
+                batch = (inject_into_points(batch[0]),)
+            before = bits(state_of(trainer)) if due() else {}
             result = real(trainer, *batch)
             if before:
                 if not math.isfinite(float(result[-1]) + float(result[0].total.detach())):
-                    (root / f"{name}.given").touch()
-                after = bits(held_by(trainer))
+                    (root / f"{name}.injected").touch()
+                after = bits(state_of(trainer))
                 if any(after.get(place, old) != old for place, old in before.items()):
                     (root / f"{name}.spread").touch()
             return result
@@ -93,48 +93,48 @@ def train_poisoned(job: str, root: Path, name: str, place: str, once: bool, step
 
     for kind in TRAINERS:
         kind.train_step = watched(kind.train_step)
-    poison_functions(place, due, state)
+    inject_into_functions(place, due, state)
     train_job(job, root, name)
 
 
-def held_by(trainer: Any) -> dict[str, Any]:
-    """What a step may change: weights and statistics of a trainer's network, and its optimiser's moments."""
+def state_of(trainer: Any) -> dict[str, Any]:
+    """Weights and statistics of a trainer's network, and its optimiser's moments: all that a step changes."""
     return {"model": trainer.model.state_dict(), "moments": trainer.optimiser.state_dict()["state"]}
 
 
-def poison_functions(place: str, due: Callable[[], bool], state: dict[str, Any]) -> None:
-    """Puts poison into what training calls: the losses, the gradients, or the batches that a trainer draws itself."""
+def inject_into_functions(place: str, due: Callable[[], bool], state: dict[str, Any]) -> None:
+    """Injects NaN or infinity into what training calls: losses, gradients, or batches that a trainer draws itself."""
 
-    def poisoned_loss(real: Callable[..., Any]) -> Callable[..., Any]:
+    def loss_with_nan(real: Callable[..., Any]) -> Callable[..., Any]:
         def loss(*arguments: Any) -> Any:
             terms = real(*arguments)
-            spoilt = {key: value * math.nan for key, value in terms.weighted.items()}
-            return replace(terms, weighted=spoilt) if due() and torch.is_grad_enabled() else terms
+            mutated = {key: value * math.nan for key, value in terms.weighted.items()}
+            return replace(terms, weighted=mutated) if due() and torch.is_grad_enabled() else terms
 
         return loss
 
     if place == "loss":
         for module, name in LOSSES:
-            setattr(module, name, poisoned_loss(getattr(module, name)))
+            setattr(module, name, loss_with_nan(getattr(module, name)))
     if place == "gradient":
         clip = nn.utils.clip_grad_norm_
 
-        def poisoned_clip(parameters: Any, *limits: Any) -> Tensor:
+        def clip_with_infinity(parameters: Any, *limits: Any) -> Tensor:
             parameters = list(parameters)
             if due():
                 next(p.grad for p in parameters if p.grad is not None).view(-1)[0] = math.inf
             return clip(parameters, *limits)
 
-        nn.utils.clip_grad_norm_ = poisoned_clip
+        nn.utils.clip_grad_norm_ = clip_with_infinity
     if place == "scan point":
         draw = cycles.CycleTrainer.batch_at
         cycles.CycleTrainer.batch_at = lambda trainer, step: (
-            poison_points(draw(trainer, step)) if due() else draw(trainer, step)
+            inject_into_points(draw(trainer, step)) if due() else draw(trainer, step)
         )
 
 
-def poison_points(batch: Any) -> Any:
-    """A batch whose first scan point has no place."""
+def inject_into_points(batch: Any) -> Any:
+    """Batch whose first scan point is NaN."""
     name = "scan_points" if "scan_points" in {f.name for f in fields(batch)} else "points"
     points = getattr(batch, name).clone()
     points[0, 0] = math.nan
@@ -142,7 +142,7 @@ def poison_points(batch: Any) -> Any:
 
 
 def all_finite(folder: Path) -> bool:
-    """Whether every tensor a run has on disk is finite, as torch and safetensors alone read them."""
+    """Whether every tensor of a run on disk is finite, read by torch and safetensors alone."""
     tensors: list[Tensor] = []
     for path in folder.rglob("*.pt"):
         tensors += [value for _, value in named_tensors(torch.load(path, map_location="cpu", weights_only=True))]

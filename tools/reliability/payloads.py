@@ -1,4 +1,4 @@
-"""`payloads`: forty files that would run code, or write elsewhere, for whoever trusted them."""
+"""`payloads`: forty malicious files that would run code, or write elsewhere, if they were trusted."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from avatar.pipeline.methods import load_avatar
 from avatar.training.checkpoints import load_checkpoint, read_weights
 from reliability.findings import Finding, all_of, none_of
 from reliability.formats import FORMATS, smpl_arrays
-from reliability.workers import run_victim
+from reliability.workers import run_worker
 
 TOOLS = Path(__file__).parents[1]
-Payload = Callable[[Path, str], Callable[[], Any]]  # writes into a folder what would run a command; gives its loader
+Payload = Callable[[Path, str], Callable[[], Any]]  # writes a file that would run a command; returns its loader
 
 
-class Trap:
+class CallWhenUnpickled:
     """An object whose pickle calls a function."""
 
     def __init__(self, function: Callable[..., Any], *arguments: Any):
@@ -44,30 +44,30 @@ class Trap:
         return self.call
 
 
-class StatefulTrap(Trap):
-    """The same by way of the state that an object is built with: its keys hold the call."""
+class CallInState(CallWhenUnpickled):
+    """The same in the state that an object is built with: its keys hold the call."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (dict, (), None, None, iter([("v_template", Trap(*self.call[:1], *self.call[1]))]))
+        return (dict, (), None, None, iter([("v_template", CallWhenUnpickled(*self.call[:1], *self.call[1]))]))
 
 
-def traps(command: str) -> dict[str, Any]:
-    """Objects that run a command when they are unpickled, by different functions and in different places."""
+def malicious_objects(command: str) -> dict[str, Any]:
+    """Objects that run a command when they are unpickled, by several functions and in several places."""
     words, code = ["/bin/sh", "-c", command], f"__import__('os').system({command!r})"
-    shell = Trap(os.system, command)
+    shell = CallWhenUnpickled(os.system, command)
     nested = {**smpl_arrays(), "v_template": np.array([shell], dtype=object)}
     return {
         "os.system": shell,
-        "os.popen": Trap(os.popen, command),
-        "os.execv": Trap(os.execv, words[0], words),
-        "os.spawnv": Trap(os.spawnv, os.P_WAIT, words[0], words),
-        "subprocess.call": Trap(subprocess.call, words),
-        "subprocess.Popen": Trap(subprocess.Popen, words),
-        "eval": Trap(builtins.eval, code),
-        "exec": Trap(builtins.exec, code),
-        "getattr": Trap(map, os.system, (command,)),
-        "in a state": StatefulTrap(os.system, command),
-        "among sound arrays": {**smpl_arrays(), "extra": shell},
+        "os.popen": CallWhenUnpickled(os.popen, command),
+        "os.execv": CallWhenUnpickled(os.execv, words[0], words),
+        "os.spawnv": CallWhenUnpickled(os.spawnv, os.P_WAIT, words[0], words),
+        "subprocess.call": CallWhenUnpickled(subprocess.call, words),
+        "subprocess.Popen": CallWhenUnpickled(subprocess.Popen, words),
+        "eval": CallWhenUnpickled(builtins.eval, code),
+        "exec": CallWhenUnpickled(builtins.exec, code),
+        "getattr": CallWhenUnpickled(map, os.system, (command,)),
+        "in a state": CallInState(os.system, command),
+        "among valid arrays": {**smpl_arrays(), "extra": shell},
         "in an object array": nested,
         "in a list": [[[shell]]],
         "as a key": {(1, shell): 2},
@@ -75,7 +75,7 @@ def traps(command: str) -> dict[str, Any]:
 
 
 def raw_pickles(command: str) -> dict[str, bytes]:
-    """Pickles by opcodes that no pickler writes any more."""
+    """Pickles with opcodes that no pickler writes any more."""
     word = command.encode()
     return {
         "INST opcode": b"(S'" + word + b"'\nios\nsystem\n.",
@@ -86,7 +86,7 @@ def raw_pickles(command: str) -> dict[str, bytes]:
 
 
 def pickled(content: Any, protocol: int = 2) -> Payload:
-    """A body model in a pickle, for the converter."""
+    """A pickled body model, for the converter."""
 
     def write(folder: Path, command: str) -> Callable[[], Any]:
         path = folder / "model.pkl"
@@ -97,24 +97,24 @@ def pickled(content: Any, protocol: int = 2) -> Payload:
 
 
 def object_arrays(name: str, key: str) -> Payload:
-    """A good npz of one format, but for one of its arrays: that one is of objects."""
+    """A valid npz of one format, except for one array of objects."""
 
     def write(folder: Path, command: str) -> Callable[[], Any]:
         path = FORMATS[name].make(folder)
         with np.load(path, allow_pickle=False) as stored:
             arrays = dict(stored)
-        np.savez(path, **(arrays | {key: np.array([Trap(os.system, command)], dtype=object)}))
+        np.savez(path, **(arrays | {key: np.array([CallWhenUnpickled(os.system, command)], dtype=object)}))
         return lambda: FORMATS[name].read(path)
 
     return write
 
 
 def torch_files(pack: Callable[[Any, io.BytesIO], Any], key: str = "model") -> Payload:
-    """A checkpoint under the name that its hash asks for."""
+    """A checkpoint named by its own hash."""
 
     def write(folder: Path, command: str) -> Callable[[], Any]:
         packed = io.BytesIO()
-        pack({key: Trap(os.system, command), "step": 1, "score": None}, packed)
+        pack({key: CallWhenUnpickled(os.system, command), "step": 1, "score": None}, packed)
         digest = hashlib.sha256(packed.getvalue()).hexdigest()
         (folder / f"step-00000001.{digest[:16]}.pt").write_bytes(packed.getvalue())
         return lambda: load_checkpoint(folder)
@@ -123,15 +123,15 @@ def torch_files(pack: Callable[[Any, io.BytesIO], Any], key: str = "model") -> P
 
 
 def shared_weights(folder: Path, command: str) -> Callable[[], Any]:
-    """A pickle that calls itself safetensors, with its right hash beside it."""
-    data = pickle.dumps(Trap(os.system, command))
+    """A pickle named as safetensors, with its valid hash beside it."""
+    data = pickle.dumps(CallWhenUnpickled(os.system, command))
     (folder / "avatar.safetensors").write_bytes(data)
     (folder / "avatar.json").write_text(json.dumps({"sha256": hashlib.sha256(data).hexdigest()}))
     return lambda: read_weights(folder / "avatar")
 
 
 def tagged_yaml(name: str, text: str, read: Callable[[Path], Any]) -> Payload:
-    """YAML with a tag that makes an object."""
+    """YAML with a tag that constructs an object."""
 
     def write(folder: Path, command: str) -> Callable[[], Any]:
         (folder / name).write_text(text.replace("COMMAND", command))
@@ -140,8 +140,8 @@ def tagged_yaml(name: str, text: str, read: Callable[[Path], Any]) -> Payload:
     return write
 
 
-def stranger_config(name: str, text: str, *arguments: str) -> Payload:
-    """A folder of configuration from elsewhere, for the real command line."""
+def untrusted_config(name: str, text: str, *arguments: str) -> Payload:
+    """An untrusted folder of configuration, for the real command line."""
 
     def write(folder: Path, command: str) -> Callable[[], Any]:
         path = folder / "conf" / name
@@ -160,8 +160,8 @@ def stranger_config(name: str, text: str, *arguments: str) -> Payload:
     return write
 
 
-def climbing_archive(name: str, read: Callable[[Path], Any]) -> Payload:
-    """An npz whose members would land elsewhere if somebody unpacked it."""
+def traversal_archive(name: str, read: Callable[[Path], Any]) -> Payload:
+    """An npz whose members have paths outside the folder it would be unpacked to."""
 
     def write(folder: Path, command: str) -> Callable[[], Any]:
         path = folder / name
@@ -173,8 +173,8 @@ def climbing_archive(name: str, read: Callable[[Path], Any]) -> Payload:
     return write
 
 
-def outside_mesh(folder: Path, command: str) -> Callable[[], Any]:
-    """A GLB that takes its numbers from another file."""
+def external_buffer(folder: Path, command: str) -> Callable[[], Any]:
+    """A GLB whose buffer is another file."""
     document = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": 36, "uri": "file:///etc/passwd"}]}
     document |= {"bufferViews": [{"buffer": 0, "byteLength": 36}], "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
     document |= {"accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}]}
@@ -187,7 +187,7 @@ def outside_mesh(folder: Path, command: str) -> Callable[[], Any]:
 
 
 def corpus(command: str) -> dict[str, Payload]:
-    """All payloads by name; ``command`` is what they try to run."""
+    """Payloads by name; ``command`` is what they try to run."""
     callback = "hydra:\n  callbacks:\n    a:\n      _target_: posix.system\n      command: COMMAND\n"
     handler = "hydra:\n  job_logging:\n    version: 1\n    handlers:\n      a: {'()': os.system, command: COMMAND}\n"
     launcher = "hydra:\n  launcher:\n    _target_: hydra._internal.core_plugins.basic_launcher.BasicLauncher\n"
@@ -197,7 +197,9 @@ def corpus(command: str) -> dict[str, Payload]:
     leak = top + "table: ${oc.env:HOME}\n"
     code = ["!!python/object/apply:os.system ['COMMAND']", "!!python/object/new:os.system ['COMMAND']"]
     code += ["!!python/name:os.system ''", "a: !!python/module:os ''"]
-    files: dict[str, Payload] = {f"pickle, {name}": pickled(trap) for name, trap in traps(command).items()}
+    files: dict[str, Payload] = {
+        f"pickle, {name}": pickled(content) for name, content in malicious_objects(command).items()
+    }
     files |= {f"pickle, {name}": pickled(data) for name, data in raw_pickles(command).items()}
     return files | {
         "npz, body model": object_arrays("SMPL npz", "weights"),
@@ -214,19 +216,19 @@ def corpus(command: str) -> dict[str, Payload]:
         "yaml, outfit": tagged_yaml("outfit.yaml", code[1], open_outfit_folder),
         "yaml, outfit by name": tagged_yaml("outfit.yaml", code[2], open_outfit_folder),
         "yaml, run's module": tagged_yaml("config.yaml", code[3], load_avatar),
-        "config, callback": stranger_config("evil.yaml", top + callback, "+evil@_global_=null"),
-        "config, log handler": stranger_config("x/evil.yaml", top + handler, "+x=evil"),
-        "config, launcher": stranger_config("x/evil.yaml", top + launcher, "+x=evil"),
-        "config, search path": stranger_config("x/evil.yaml", top + search, "+x=evil"),
-        "config, package": stranger_config("x/evil.yaml", "# @package hydra\nverbose: true\n", "+x=evil"),
-        "config, environment": stranger_config("x/evil.yaml", leak, "+x=evil"),
-        "archive, climbing": climbing_archive("motion.npz", read_motion),
-        "mesh, another's file": outside_mesh,
+        "config, callback": untrusted_config("evil.yaml", top + callback, "+evil@_global_=null"),
+        "config, log handler": untrusted_config("x/evil.yaml", top + handler, "+x=evil"),
+        "config, launcher": untrusted_config("x/evil.yaml", top + launcher, "+x=evil"),
+        "config, search path": untrusted_config("x/evil.yaml", top + search, "+x=evil"),
+        "config, package": untrusted_config("x/evil.yaml", "# @package hydra\nverbose: true\n", "+x=evil"),
+        "config, environment": untrusted_config("x/evil.yaml", leak, "+x=evil"),
+        "archive, path traversal": traversal_archive("motion.npz", read_motion),
+        "mesh, external buffer": external_buffer,
     }
 
 
 def payload_trial(root: Path) -> list[Finding]:
-    """Loads every payload through the door it aims at, each in a process of its own, and looks for what it left."""
+    """Loads every payload by its reader, each in a process of its own, and looks for its canary file."""
     folder = root / "payloads"
     shutil.rmtree(folder, ignore_errors=True)
     names = list(corpus("true"))
@@ -235,10 +237,10 @@ def payload_trial(root: Path) -> list[Finding]:
         here, canary = folder / str(number), folder / str(number) / "canary"
         here.mkdir(parents=True)
         load = corpus(f"touch {canary}")[name](here, f"touch {canary}")
-        outcome = run_victim(load)
+        outcome = run_worker(load)
         executed += canary.exists() or (folder / "canary").exists() or (root / "canary").exists()
         refused += bool(outcome.error)
     return [
         none_of("payloads", "payloads that ran or wrote elsewhere", executed, len(names)),
-        all_of("payloads", "refused by one typed error", refused, len(names)),
+        all_of("payloads", "refused with one typed error", refused, len(names)),
     ]

@@ -1,4 +1,4 @@
-"""The smallest real jobs of every kind: a few frames of the embedded sample, networks of some thousand weights."""
+"""Small training jobs of every kind: a few frames of the embedded sample, networks of some thousand weights."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def run_config(job: str, root: Path, name: str = "default", **options: Any) -> R
 
 
 def prepare(root: Path) -> None:
-    """The data, and the canonical scans that `scanimate` learns from."""
+    """Data, and the canonical scans that `scanimate` is trained on."""
     write_data(root)
     torch.set_num_threads(1)
     config = canonicalizer_config(root, "nearest", Skinning.nearest)
@@ -128,13 +128,13 @@ def prepare(root: Path) -> None:
 
 
 def folder_of(job: str, root: Path, name: str = "default") -> Path:
-    """Where a job's run lives."""
+    """Run folder of a job."""
     config = canonicalizer_config(root, name) if job == "canonicalizer" else run_config(job, root, name)
     return config.folder
 
 
 def train_job(job: str, root: Path, name: str = "default", **options: Any) -> Path:
-    """Trains a job to its end, or goes on with it, on one thread; gives the run's folder."""
+    """Trains a job to its end, or resumes it, on one thread; returns the run's folder."""
     torch.set_num_threads(1)
     if job == "canonicalizer":
         return train_canonicalizer(canonicalizer_config(root, name))
@@ -142,6 +142,6 @@ def train_job(job: str, root: Path, name: str = "default", **options: Any) -> Pa
 
 
 def weights_digest(folder: Path) -> str:
-    """The sha256 of a finished run's weights file; nothing for a run that is not finished."""
+    """SHA-256 of a finished run's weights file; empty for a run that is not finished."""
     paths = list(folder.glob("*.safetensors"))
     return hashlib.sha256(paths[0].read_bytes()).hexdigest() if len(paths) == 1 else ""

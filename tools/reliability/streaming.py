@@ -1,4 +1,4 @@
-"""`stream`: training on an outfit far larger than memory, frame by frame from disk."""
+"""`stream`: training on a data set far larger than memory, streamed frame by frame from disk."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from avatar.io.npz import write_whole
 from avatar.pipeline.methods import train
 from reliability.findings import Finding
 from reliability.small_jobs import run_config, write_data
-from reliability.workers import peak_memory, work_alone
+from reliability.workers import call_in_process, peak_memory
 
 SCAN_POINTS = 400_000
 LIMIT = 2 << 30  # bytes resident
@@ -25,14 +25,14 @@ BATCH = 4
 
 
 def stream_trial(root: Path, gigabytes: float, visited: int) -> list[Finding]:
-    """Trains a network on an outfit of so many gigabytes for as many frames as are to be ``visited``, and looks at RSS.
+    """Trains on an outfit of so many gigabytes for as many frames as are to be ``visited``, and measures peak memory.
 
-    The outfit is real to whoever reads it: every frame is a file of its own name with 400,000 scan points. On the disk
-    they are links to one file, for the reader cannot tell and the disk need not be large.
+    Every frame is a file of its own name with 400,000 scan points. On the disk they are hard links to one file, which
+    makes no difference to the reader and needs no large disk.
     """
     folder = root / "data" / "packed" / "large"
-    size = work_alone(write_large_outfit, root, folder, gigabytes)
-    seen, frames = work_alone(train_on_stream, root, visited, timeout=3600), size["frames"]
+    size = call_in_process(write_large_outfit, root, folder, gigabytes)
+    seen, frames = call_in_process(train_on_stream, root, visited, timeout=3600), size["frames"]
     return [
         Finding("stream", "size of the outfit's frames as arrays", size["gigabytes"], "GB", frames, gigabytes),
         Finding("stream", "frames read while training", seen["frames"], f"of {frames}", frames, visited),
@@ -41,7 +41,7 @@ def stream_trial(root: Path, gigabytes: float, visited: int) -> list[Finding]:
 
 
 def write_large_outfit(root: Path, folder: Path, gigabytes: float) -> dict[str, Any]:
-    """Writes one packed frame with many scan points, and links to it until their arrays have the size asked for."""
+    """Writes one packed frame with many scan points, and hard links to it until their arrays have the given size."""
     shutil.rmtree(folder, ignore_errors=True)
     outfit = OpenOutfit(write_data(root), "open", ScanConfig(points=SCAN_POINTS))
     frame = outfit.load("train", outfit.frames("train")[0])
@@ -57,7 +57,7 @@ def write_large_outfit(root: Path, folder: Path, gigabytes: float) -> dict[str, 
 
 
 def train_on_stream(root: Path, visited: int) -> dict[str, int]:
-    """Trains for as many steps as so many frames take; gives the files read and the peak resident memory, bytes."""
+    """Trains for as many steps as so many frames take; returns the files read and the peak resident memory, bytes."""
     load, read = PackedOutfit.load, set()
 
     def counted(outfit: PackedOutfit, split: str, name: str) -> Any:

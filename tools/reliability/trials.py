@@ -1,4 +1,4 @@
-"""`torture`: all trials by name, one after the other, each written down as it ends, so that a long run can go on."""
+"""Reliability trials by name, run one after the other; each result is saved as it ends, so that a long run resumes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from avatar.io.documents import read_json
 from avatar.io.npz import write_whole
 from avatar.pipeline.scores import current_commit
 from reliability.corruption import flip_trial
-from reliability.decompression import bomb_trial
+from reliability.decompression_bombs import bomb_trial
 from reliability.findings import Finding, to_score, to_table
 from reliability.full_disks import disk_trial
 from reliability.fuzzing import fuzz_trial
 from reliability.hostile_names import name_trial
 from reliability.killing import kill_trial
 from reliability.meshing import mesh_trial
-from reliability.nan_injection import poison_trial
+from reliability.nan_injection import nan_trial
 from reliability.offline import network_trial
 from reliability.payloads import payload_trial
 from reliability.races import race_trial
@@ -37,25 +37,25 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class ReliabilityConfig:
-    """Which trials, how much of each, and where; the defaults are the published run's."""
+    """Trials to run, their sizes, and folders; the defaults are those of the published table."""
 
     only: tuple[str, ...] = ()  # names of trials; all of them if empty
-    kills: int = 50  # trainings killed with -9
-    kills_in_saves: int = 15  # of these, between two calls by which a save reaches the disk
-    flips: int = 1000  # bits of checkpoints turned over, one at a time
-    truncations: int = 200  # checkpoints cut short
-    files: int = 10_000  # spoilt files
+    kills: int = 50  # trainings killed by SIGKILL
+    kills_in_saves: int = 15  # of these, between two system calls of a save
+    flips: int = 1000  # bit flips of checkpoints, one at a time
+    truncations: int = 200  # truncated checkpoints
+    files: int = 10_000  # mutated files
     names: int = 200  # hostile names
     full_disks: int = 20
-    poisons: int = 30  # places of numbers that are none
-    races: int = 50  # of two jobs for one folder
+    injections: int = 30  # of NaN or infinity into trainings
+    races: int = 50  # of two jobs for one run folder
     meshes: int = 1000  # frames meshed
     demo_minutes: float = 0.2  # training time of the demo without a network
     stream_gb: float = 10.0  # size of the outfit that is streamed
     stream_frames: int = 240  # frames of it that training reads
     seed: int = 0
-    again: bool = False  # do finished trials of the same size again
-    root: Path = Path("runs/torture")  # where to work; emptied trial by trial
+    again: bool = False  # repeat finished trials of the same size
+    root: Path = Path("runs/reliability")  # working folder; emptied trial by trial
     out: Path = Path("runs/tables")  # where the table's files go
     table: str = "reliability"  # name of the table's files there
 
@@ -64,7 +64,7 @@ class ReliabilityConfig:
         unknown = [name for name in self.only if name not in TRIALS]
         if unknown:
             raise AvatarError(f"only: expected some of {', '.join(TRIALS)}, got {unknown[0]!r}.")
-        for name in ("kills", "flips", "truncations", "files", "names", "full_disks", "poisons", "races", "meshes"):
+        for name in ("kills", "flips", "truncations", "files", "names", "full_disks", "injections", "races", "meshes"):
             if getattr(self, name) < 1:
                 raise AvatarError(f"{name}: expected at least 1, got {getattr(self, name)}.")
         if not 0 <= self.kills_in_saves <= self.kills:
@@ -75,7 +75,7 @@ TRIALS: dict[str, tuple[tuple[str, ...], Callable[[ReliabilityConfig, Path], lis
     "kill": (("kills", "kills_in_saves"), lambda c, root: kill_trial(root, c.kills, c.kills_in_saves, c.seed)),
     "flips": (("flips", "truncations"), lambda c, root: flip_trial(root, c.flips, c.truncations, c.seed)),
     "disk": (("full_disks",), lambda c, root: disk_trial(root, c.full_disks, c.seed)),
-    "poison": (("poisons",), lambda c, root: poison_trial(root, c.poisons, c.seed)),
+    "nan": (("injections",), lambda c, root: nan_trial(root, c.injections, c.seed)),
     "race": (("races",), lambda c, root: race_trial(root, c.races)),
     "fuzz": (("files",), lambda c, root: fuzz_trial(root, c.files, c.seed)),
     "bombs": ((), lambda c, root: bomb_trial(root)),
@@ -89,47 +89,49 @@ TRIALS: dict[str, tuple[tuple[str, ...], Callable[[ReliabilityConfig, Path], lis
 
 @prepared_process()
 def check_reliability(config: ReliabilityConfig) -> Path:
-    """Runs the trials that are asked for and not done yet; gives the table, ``<out>/reliability.md``.
+    """Runs the chosen trials that are not finished yet; returns the table, ``<out>/reliability.md``.
 
-    Beside it stands ``reliability.csv``. Trials done earlier, with whatever counts, keep their rows.
+    ``reliability.csv`` is written beside it. Trials finished earlier, with whatever sizes, keep their rows.
 
     Raises:
-        AvatarError: at the end, when a figure missed its goal, naming the first.
+        AvatarError: at the end, when a finding missed its goal, naming the first.
     """
-    torch.set_num_threads(1)  # before anything forks: a parent's threads are lost on its children
+    torch.set_num_threads(1)  # before anything forks: children have none of a parent's threads
     root = config.root.resolve()
     for name in config.only or TRIALS:
         options, trial = TRIALS[name]
         counts = {option: getattr(config, option) for option in (*options, "seed")}
         done = root / f"{name}.json"
         if not config.again and done.is_file() and read_json(done)["counts"] == counts:
-            log.info("%s: done before.", name)
+            log.info("%s: finished before.", name)
             continue
         log.info("%s: %s", name, ", ".join(f"{key}={value}" for key, value in counts.items()))
         shutil.rmtree(root / name, ignore_errors=True)
         started, commit = time.monotonic(), current_commit()
         findings = trial(config, root / name)
         seconds = time.monotonic() - started
-        told = {"counts": counts, "seconds": seconds, "commit": commit}
-        write_whole(done, json.dumps(told | {"findings": [asdict(f) for f in findings]}, indent=1).encode())
+        result = {"counts": counts, "seconds": seconds, "commit": commit}
+        write_whole(done, json.dumps(result | {"findings": [asdict(f) for f in findings]}, indent=1).encode())
         log.info("%s", to_table(findings))
     return write_table(config)
 
 
 def write_table(config: ReliabilityConfig) -> Path:
-    """Writes the rows and the table of all trials done in a root, in the order of `TRIALS`.
+    """Writes the rows and the table of all trials finished in a root, in the order of `TRIALS`.
 
     Raises:
-        AvatarError: when a figure missed its goal.
+        AvatarError: when a finding missed its goal.
     """
     findings, rows = [], []
     for name in TRIALS:
         path = config.root / f"{name}.json"
         if path.is_file():
-            told = read_json(path)
-            found = [Finding(**values) for values in told["findings"]]
+            result = read_json(path)
+            found = [Finding(**values) for values in result["findings"]]
             findings += found
-            rows += [to_score(finding, told["counts"]["seed"], told["seconds"], told["commit"]) for finding in found]
+            rows += [
+                to_score(finding, result["counts"]["seed"], result["seconds"], result["commit"]) for finding in found
+            ]
     write_scores(config.out / f"{config.table}.csv", Scores(rows))
     path = config.out / f"{config.table}.md"
     write_whole(path, to_table(findings).encode())

@@ -1,4 +1,4 @@
-"""Processes to be killed, crashed and starved: real ones, forked, so that they need not import all anew."""
+"""Worker processes that are killed or crash: forked, so that they need not import the program again."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ import torch
 
 from avatar.checks import AvatarError
 
-CRASH = 70  # exit code of a victim that an untyped error ended
+CRASH = 70  # exit code of a worker that ended with an untyped error
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a process ended.
+    """Outcome of a process.
 
-    ``code`` is its exit code, negative for a signal and None where it had to be killed for taking too long; ``value``
-    what it gave back, ``error`` the message of an `AvatarError`, ``crash`` the traceback of any other exception.
+    ``code`` is its exit code, negative for a signal and None after a timeout; ``value`` is what its function returned,
+    ``error`` the message of an `AvatarError`, ``crash`` the traceback of any other exception.
     """
 
     code: int | None
@@ -39,10 +39,10 @@ class Outcome:
     crash: str = ""
 
 
-class Victim:
-    """A forked process that calls one function; what it prints goes to a file or nowhere.
+class Worker:
+    """Forked process that calls one function; its output goes to a file or nowhere.
 
-    Torch works on one thread in it, for a forked process may not use its parent's.
+    Torch has one thread in it, because a forked process cannot use its parent's.
     """
 
     def __init__(self, function: Callable[..., Any], *arguments: Any, log: Path | None = None):
@@ -52,15 +52,15 @@ class Victim:
         far.close()
 
     def kill(self) -> None:
-        """``kill -9``."""
+        """Sends SIGKILL."""
         os.kill(self.process.pid, signal.SIGKILL)
 
     def end(self, timeout: float = 600.0) -> Outcome:
-        """Waits for the process, kills it when it takes longer, and says how it ended."""
+        """Waits for the process, kills it after the timeout, and returns its outcome."""
         answer: dict[str, Any] = {}
         in_time = self.near.poll(timeout)
         if in_time:
-            with suppress(EOFError, OSError):  # it died without a word
+            with suppress(EOFError, OSError):  # it ended without an answer
                 answer = json.loads(self.near.recv_bytes())
         else:
             self.kill()
@@ -70,7 +70,7 @@ class Victim:
 
 
 def _serve(far: Connection, log: Path | None, function: Callable[..., Any], arguments: tuple) -> None:
-    """The victim's side: calls the function and sends what came of it, in JSON."""
+    """Worker's side: calls the function and sends the outcome as JSON."""
     with Path(log or os.devnull).open("a") as sink:
         os.dup2(sink.fileno(), 1)
         os.dup2(sink.fileno(), 2)
@@ -87,36 +87,36 @@ def _serve(far: Connection, log: Path | None, function: Callable[..., Any], argu
     os._exit(0 if "value" in answer else 2 if "error" in answer else CRASH)
 
 
-def run_victim(function: Callable[..., Any], *arguments: Any, timeout: float = 600.0) -> Outcome:
-    """Calls a function in a process of its own."""
-    return Victim(function, *arguments).end(timeout)
+def run_worker(function: Callable[..., Any], *arguments: Any, timeout: float = 600.0) -> Outcome:
+    """Outcome of a function that is called in a worker process."""
+    return Worker(function, *arguments).end(timeout)
 
 
-def work_alone(function: Callable[..., Any], *arguments: Any, timeout: float = 600.0) -> Any:
-    """What a function gives in a process of its own, so that this one stays free of threads and of what it loads.
+def call_in_process(function: Callable[..., Any], *arguments: Any, timeout: float = 600.0) -> Any:
+    """Value of a function that is called in a worker process, so that this one starts no threads and loads nothing.
 
     Raises:
-        RuntimeError: when it fails: a trial's own work must not.
+        RuntimeError: when it fails, as the preparation of a trial must not.
     """
-    outcome = run_victim(function, *arguments, timeout=timeout)
+    outcome = run_worker(function, *arguments, timeout=timeout)
     if outcome.code:
         raise RuntimeError(outcome.crash or outcome.error or f"{function.__name__}: exit code {outcome.code}")
     return outcome.value
 
 
 def peak_memory() -> int:
-    """The most memory this process has had resident, bytes."""
+    """Peak resident memory of this process, bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def resident_memory(pid: int) -> int:
-    """Memory that a process has resident now, bytes."""
+    """Resident memory of a process now, bytes."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def wait_until(true: Callable[[], bool], seconds: float) -> bool:
-    """Waits for something to become true, for so long at most; says whether it did."""
+    """Waits until a condition is true or the time is over; returns whether it is true."""
     ends = time.monotonic() + seconds
     while not true():
         if time.monotonic() > ends:

@@ -1,4 +1,4 @@
-"""open3d's nearest neighbours, for benchmarks: what `avatar.geometry.neighbours` is measured by."""
+"""Nearest neighbours by open3d, which `avatar.geometry.neighbours` is compared with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`bombs`: small files that promise or unpack to gigabytes; each must be refused before the memory is taken."""
+"""`bombs`: decompression bombs and headers that declare gigabytes; each must be refused before memory is allocated."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from avatar.training.checkpoints import load_checkpoint, read_weights
 from reliability.findings import Finding, all_of
 from reliability.formats import BVH, smpl_arrays
 from reliability.small_jobs import DECODER, folder_of, prepare, train_job
-from reliability.workers import peak_memory, run_victim, work_alone
+from reliability.workers import call_in_process, peak_memory, run_worker
 
-MOST = 64  # MiB that a refusal may take
+MOST = 64  # MiB that a refusal may allocate
 HUGE = 1 << 33
 Bomb = Callable[[Path], Callable[[], Any]]
 PLY = "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
@@ -42,8 +42,8 @@ PLY += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny"
 FACES = "element face {count}\nproperty list uchar int vertex_indices\n"
 
 
-def file_bomb(name: str, data: bytes, read: Callable[[Path], Any]) -> Bomb:
-    """A file of fixed content."""
+def bomb_file(name: str, data: bytes, read: Callable[[Path], Any]) -> Bomb:
+    """A decompression bomb of fixed content."""
 
     def write(folder: Path) -> Callable[[], Any]:
         (folder / name).write_bytes(data)
@@ -53,7 +53,7 @@ def file_bomb(name: str, data: bytes, read: Callable[[Path], Any]) -> Bomb:
 
 
 def deflated(member: str, kind: str, shape: tuple[int, ...], megabytes: int) -> bytes:
-    """An npz whose one member unpacks to so many mebibytes of zeros, under a header that promises a shape."""
+    """An npz whose one member unpacks to so many mebibytes of zeros, under a header that declares a shape."""
     header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     packed = io.BytesIO()
@@ -68,7 +68,7 @@ def deflated(member: str, kind: str, shape: tuple[int, ...], megabytes: int) -> 
 
 
 def deflated_checkpoint(folder: Path) -> Callable[[], Any]:
-    """A checkpoint of zeros, deflated, under the name that its hash asks for."""
+    """A deflated checkpoint of zeros, named by its own hash."""
     plain, squeezed = io.BytesIO(), io.BytesIO()
     torch.save({"model": {"weight": torch.zeros(1 << 24)}, "step": 1, "score": None}, plain)
     with zipfile.ZipFile(plain) as source, zipfile.ZipFile(squeezed, "w") as target:
@@ -80,7 +80,7 @@ def deflated_checkpoint(folder: Path) -> Callable[[], Any]:
 
 
 def weights_bomb(folder: Path) -> Callable[[], Any]:
-    """A safetensors header that promises more than its file has."""
+    """A safetensors header that declares more bytes than its file has."""
     header = json.dumps({"a": {"dtype": "F32", "shape": [HUGE], "data_offsets": [0, 4 * HUGE]}}).encode()
     data = struct.pack("<Q", len(header)) + header + bytes(64)
     (folder / "avatar.safetensors").write_bytes(data)
@@ -89,10 +89,10 @@ def weights_bomb(folder: Path) -> Callable[[], Any]:
 
 
 def network_bomb(**changes: Any) -> Bomb:
-    """A run whose settings ask for a network that no machine holds, beside a handful of weights."""
+    """A run whose settings declare a network larger than any memory, with a few weights."""
 
     def write(folder: Path) -> Callable[[], Any]:
-        run = folder_of("closet", folder.parents[1], "sound")
+        run = folder_of("closet", folder.parents[1], "valid")
         for name in ("template.npz", "config.yaml"):
             shutil.copyfile(run / name, folder / name)
         description = json.loads((run / "avatar.json").read_text())
@@ -114,14 +114,14 @@ def glb(document: dict[str, Any], binary: int) -> bytes:
 
 
 def corpus() -> dict[str, Bomb]:
-    """All bombs by name."""
+    """Decompression bombs by name."""
     count = 4_000_000_000
     accessor = {"bufferView": 0, "componentType": 5126, "count": count, "type": "VEC3"}
     scene = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": 64}]}
     scene |= {"bufferViews": [{"buffer": 0, "byteLength": 64}]}
     scene |= {"accessors": [accessor], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}
     scene |= {"nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}], "scene": 0}
-    lazy = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    aliases = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefghi", "bcdefghij")
     )
     wide = {**DECODER, "width": 1 << 20}
@@ -129,33 +129,33 @@ def corpus() -> dict[str, Bomb]:
     long_bytes = b"\x80\x04\x8e" + struct.pack("<Q", 1 << 40) + b"x."
     points, faces = PLY.format(count=count), FACES.format(count=count)
     return {
-        "npz of 24 bytes that promises 3 GiB": file_bomb(
+        "npz of 24 bytes that declares 3 GiB": bomb_file(
             "template.npz", deflated("vertices", "<f4", (1 << 28, 3), 0), packed_body
         ),
-        "npz of zeros": file_bomb("motion.npz", deflated("trans", "<f4", (1 << 22, 3), 48), read_motion),
-        "npz of zeros, a frame": file_bomb("f.npz", deflated("cloth_high", "|u1", (3, 24 << 20), 72), read_open_frame),
-        "npz of many members": file_bomb("model.npz", crowded_npz(), convert_and_drop),
-        "pickle memo": file_bomb("model.pkl", memo, convert_and_drop),
-        "pickle length": file_bomb("model.pkl", long_bytes, convert_and_drop),
-        "pickle sparse matrix": file_bomb("model.pkl", sparse_model(), convert_and_drop),
-        "ply points": file_bomb("points.ply", f"{points}end_header\n".encode(), read_points),
-        "ply mesh": file_bomb("mesh.ply", f"{points}{FACES.format(count=9)}end_header\n".encode(), read_mesh),
-        "ply faces": file_bomb("mesh.ply", f"{PLY.format(count=3)}{faces}end_header\n".encode() + bytes(72), read_mesh),
-        "off": file_bomb("mesh.off", f"OFF\n{count} {count} 0\n0 0 0\n".encode(), read_mesh),
-        "stl": file_bomb("mesh.stl", bytes(80) + struct.pack("<I", count) + bytes(100), read_mesh),
-        "glb accessor": file_bomb("mesh.glb", glb(scene, 64), read_mesh),
-        "BVH frames": file_bomb("walk.bvh", BVH.replace("Frames: 3", "Frames: 1000000000").encode(), read_bvh),
-        "yaml of a billion laughs": file_bomb("config.yaml", lazy.encode(), read_yaml),
-        "yaml, deep": file_bomb("config.yaml", b"a: " + b"[" * 20_000, read_yaml),
-        "json, deep": file_bomb("avatar.json", b"[" * 200_000, read_json),
+        "npz of zeros": bomb_file("motion.npz", deflated("trans", "<f4", (1 << 22, 3), 48), read_motion),
+        "npz of zeros, a frame": bomb_file("f.npz", deflated("cloth_high", "|u1", (3, 24 << 20), 72), read_open_frame),
+        "npz of many members": bomb_file("model.npz", npz_of_many_members(), convert),
+        "pickle memo": bomb_file("model.pkl", memo, convert),
+        "pickle length": bomb_file("model.pkl", long_bytes, convert),
+        "pickle sparse matrix": bomb_file("model.pkl", sparse_model(), convert),
+        "ply points": bomb_file("points.ply", f"{points}end_header\n".encode(), read_points),
+        "ply mesh": bomb_file("mesh.ply", f"{points}{FACES.format(count=9)}end_header\n".encode(), read_mesh),
+        "ply faces": bomb_file("mesh.ply", f"{PLY.format(count=3)}{faces}end_header\n".encode() + bytes(72), read_mesh),
+        "off": bomb_file("mesh.off", f"OFF\n{count} {count} 0\n0 0 0\n".encode(), read_mesh),
+        "stl": bomb_file("mesh.stl", bytes(80) + struct.pack("<I", count) + bytes(100), read_mesh),
+        "glb accessor": bomb_file("mesh.glb", glb(scene, 64), read_mesh),
+        "BVH frames": bomb_file("walk.bvh", BVH.replace("Frames: 3", "Frames: 1000000000").encode(), read_bvh),
+        "yaml with exponential aliases": bomb_file("config.yaml", aliases.encode(), read_yaml),
+        "yaml, deep": bomb_file("config.yaml", b"a: " + b"[" * 20_000, read_yaml),
+        "json, deep": bomb_file("avatar.json", b"[" * 200_000, read_json),
         "checkpoint, deflated": deflated_checkpoint,
         "safetensors header": weights_bomb,
         "settings of a huge network": network_bomb(garment_decoder=wide),
     }
 
 
-def crowded_npz() -> bytes:
-    """An npz with a hundred thousand members."""
+def npz_of_many_members() -> bytes:
+    """An npz with twenty thousand members."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for number in range(20_000):
@@ -164,40 +164,40 @@ def crowded_npz() -> bytes:
 
 
 def sparse_model() -> bytes:
-    """A body model's pickle whose sparse matrix says that it has a billion rows and columns."""
+    """A body model's pickle whose sparse matrix declares a billion rows and columns."""
     regressor = csc_matrix((1, 1))
     regressor._shape = (10**9, 10**9)
     return pickle.dumps({**smpl_arrays(), "J_regressor": regressor})
 
 
-def convert_and_drop(path: Path) -> Any:
+def convert(path: Path) -> Any:
     """A body model through the converter."""
     return convert_body_model(path, path.with_name("converted.npz"))
 
 
 def bomb_trial(root: Path) -> list[Finding]:
-    """Reads every bomb in a process of its own and looks at what its refusal took."""
-    work_alone(prepare, root)
-    work_alone(train_job, "closet", root, "sound")
+    """Reads every decompression bomb in a process of its own and measures the memory of its refusal."""
+    call_in_process(prepare, root)
+    call_in_process(train_job, "closet", root, "valid")
     folder, bombs = root / "bombs", corpus()
     shutil.rmtree(folder, ignore_errors=True)
     refused, most = 0, 0.0
-    told = {}
+    outcomes = {}
     for number, (name, write) in enumerate(bombs.items()):
         (folder / str(number)).mkdir(parents=True)
-        outcome = run_victim(measure_refusal, write(folder / str(number)), timeout=60)
-        told[name] = vars(outcome)
+        outcome = run_worker(measure_refusal, write(folder / str(number)), timeout=60)
+        outcomes[name] = vars(outcome)
         refused += outcome.value is not None and outcome.value["refused"]
         most = max(most, outcome.value["MiB"] if outcome.value else 1e6)
-    write_whole(root / "bombs.json", json.dumps(told, indent=1).encode())
+    write_whole(root / "bombs.json", json.dumps(outcomes, indent=1).encode())
     return [
-        all_of("bombs", "refused by one typed error", refused, len(bombs)),
-        Finding("bombs", "memory that a refusal took, at most", round(most, 1), "MiB", len(bombs), None, MOST),
+        all_of("bombs", "refused with one typed error", refused, len(bombs)),
+        Finding("bombs", "largest memory of a refusal", round(most, 1), "MiB", len(bombs), None, MOST),
     ]
 
 
 def measure_refusal(load: Callable[[], Any]) -> dict[str, Any]:
-    """Whether loading is refused, and by how much the peak of this process's memory rose meanwhile."""
+    """Whether loading is refused, and the increase of this process's peak memory meanwhile."""
     require("trimesh")  # a library is no part of a refusal
     before, refused = peak_memory(), False
     try:
