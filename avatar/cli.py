@@ -17,7 +17,7 @@ from types import FrameType
 from typing import NoReturn
 
 from avatar.invocation import CORE, PIPE_CLOSED, STOPPED, activation_line, checkout, command_line, install_line
-from avatar.verbs import VERBS, resolve
+from avatar.verbs import VERBS, Verb, resolve
 
 OLDEST = (3, 11)
 
@@ -41,22 +41,26 @@ def main() -> NoReturn:
     sys.exit(code)
 
 
-def run(verb: str) -> NoReturn:
+def run(name: str, verb: Verb | None = None) -> NoReturn:
     """Runs a verb with the arguments of the command line, and leaves with its exit code.
 
     The code is 0, 2 for bad input or a missing package, 75 after a signal, or 141 where the reader of its output has
     left; faults of the program end in a traceback.
+
+    Args:
+        name: the verb's name.
+        verb: the verb, where it is not in `VERBS`.
     """
 
     def leave(number: int, frame: FrameType | None) -> None:
-        os.write(2, f"{verb}: stopped by {signal.Signals(number).name} before it began.\n".encode())
+        os.write(2, f"{name}: stopped by {signal.Signals(number).name} before it began.\n".encode())
         os._exit(STOPPED)
 
     for number in (signal.SIGINT, signal.SIGTERM):  # until the verb listens itself
         signal.signal(number, leave)
     try:
         try:
-            start(verb)
+            start(name, verb or VERBS[name])
             code: int | str | None = 0
         except SystemExit as leaving:
             code = leaving.code
@@ -69,28 +73,28 @@ def run(verb: str) -> NoReturn:
     sys.exit(code)
 
 
-def start(verb: str) -> None:
+def start(name: str, verb: Verb) -> None:
     """Imports what a verb needs and calls it."""
     try:
         if sys.version_info < OLDEST:
             version = ".".join(map(str, sys.version_info[:2]))
-            sys.exit(refuse(verb, f"expected Python 3.11 or newer, got {version}.{environment_hint()}"))
-        if VERBS[verb].settings:
+            sys.exit(refuse(name, f"expected Python 3.11 or newer, got {version}.{environment_hint()}"))
+        if verb.settings:
             from avatar.config import command
 
-            command(verb)
+            command(name, verb=verb)
         else:
-            resolve(VERBS[verb].run)()
+            resolve(verb.run)()
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
         if package not in CORE:
             raise
-        sys.exit(refuse(verb, missing_package(package, error)))
+        sys.exit(refuse(name, missing_package(package, error)))
 
 
-def refuse(verb: str, message: object) -> int:
+def refuse(name: str, message: object) -> int:
     """Prints why a verb does not do what it was asked to; gives the exit code for it."""
-    print(f"{verb}: {message}", file=sys.stderr)
+    print(f"{name}: {message}", file=sys.stderr)
     return 2
 
 

@@ -33,12 +33,13 @@ from avatar.checks import AvatarError
 from avatar.cli import refuse, silence_closed_streams
 from avatar.environment import prepared_process
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
+from avatar.io.documents import read_yaml
 from avatar.pipeline.endings import report_ending
 from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
 from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.signals import Stopped, leave_when_asked
-from avatar.verbs import VERBS, resolve
+from avatar.verbs import VERBS, Verb, resolve
 from avatar.world import current_world, torchrun_world
 
 CONF = (checkout() or PACKAGE) / "conf"  # a wheel has it in the package
@@ -47,17 +48,23 @@ Settings = TypeVar("Settings")
 report = logging.getLogger(__name__)
 
 
-def settings_class(verb: str) -> type:
+def settings_class(verb: Verb) -> type:
     """The class of a verb's settings."""
-    return resolve(VERBS[verb].settings)
+    return resolve(verb.settings)
 
 
-def register(verb: str) -> None:
-    """Stores the defaults of a verb's settings, and of all methods' where it takes one, under ``<name>_defaults``."""
+def register(name: str, verb: Verb | None = None) -> None:
+    """Stores the defaults of a verb's settings, and of all methods' where it takes one, under ``<name>_defaults``.
+
+    The configuration file of a verb that is not in `VERBS` is stored beside them, for Hydra searches ``conf/`` alone.
+    """
+    verb = verb or VERBS[name]
     store, defaults = ConfigStore.instance(), settings_to_dict(settings_class(verb)())
-    store.store(name=f"{verb}_defaults", node=defaults)
-    for name, kind in resolve(METHOD_SETTINGS).items() if isinstance(defaults.get("method"), dict) else ():
-        store.store(group="method", name=f"{name}_defaults", node={"settings": settings_to_dict(kind())})
+    store.store(name=f"{name}_defaults", node=defaults)
+    for method, kind in resolve(METHOD_SETTINGS).items() if isinstance(defaults.get("method"), dict) else ():
+        store.store(group="method", name=f"{method}_defaults", node={"settings": settings_to_dict(kind())})
+    if verb.conf:
+        store.store(name=name, node=read_yaml(verb.conf))
 
 
 def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
@@ -66,15 +73,16 @@ def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
     return settings_from_dict(kind, plain)
 
 
-def compose_settings(verb: str, *overrides: str) -> Any:
+def compose_settings(name: str, *overrides: str, verb: Verb | None = None) -> Any:
     """A verb's settings as the command line would give them with these overrides; within a verb's run as well."""
-    register(verb)
+    verb = verb or VERBS[name]
+    register(name, verb)
     running = GlobalHydra.instance().is_initialized()
     with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return to_settings(settings_class(verb), hydra.compose(verb, list(overrides)))
+        return to_settings(settings_class(verb), hydra.compose(name, list(overrides)))
 
 
-def command(verb: str, run: Callable[[Any], Any] | None = None) -> None:
+def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | None = None) -> None:
     """Runs a verb from the command line: composes its config, converts it, calls its function with the settings.
 
     Bad input ends in one line on standard error and exit code 2, not in a traceback; a signal that asks to stop in
@@ -83,39 +91,41 @@ def command(verb: str, run: Callable[[Any], Any] | None = None) -> None:
     is called with the settings of the jobs that did finish, if any, unless the multirun was asked to stop.
 
     Args:
-        verb: its name in `VERBS`.
+        name: the verb's name.
         run: another function than the verb's own.
+        verb: the verb, where it is not in `VERBS`.
     """
+    verb = verb or VERBS[name]
     journal = Path("runs/multirun").absolute() / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{os.getpid()}"
     os.environ["AVATAR_MULTIRUN"] = str(journal)  # conf/hydra/quiet.yaml: the launchers' own files go there as well
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on, instead of printing them its way
-    parent, run = os.getpid(), run or resolve(VERBS[verb].run)
+    parent, run = os.getpid(), run or resolve(verb.run)
 
-    @hydra.main(version_base="1.3", config_path=str(CONF), config_name=verb)
+    @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
     def main(config: DictConfig) -> None:
-        run_job(verb, run, config, journal, parent)
+        run_job(name, verb, run, config, journal, parent)
 
     code = 0
     with torchrun_world() as world, leave_when_asked(lambda number: ask_to_stop(journal, number)):
         listen_to_verbs(logging.INFO if world.is_main else logging.WARNING)
         try:
-            register(verb)
-            sys.argv[1:] = tidy_arguments(sys.argv[1:], sweeps=bool(VERBS[verb].then))
+            register(name, verb)
+            sys.argv[1:] = tidy_arguments(sys.argv[1:], sweeps=bool(verb.then))
             refuse_code(sys.argv[1:])
             main()
         except SystemExit as leaving:
             code = leaving.code
         except (HydraException, OmegaConfBaseException) as error:
-            code = refuse(verb, explain(error, verb, sys.argv[1:], CONF))
+            code = refuse(name, explain(error, name, sys.argv[1:], CONF))
         except AvatarError as error:
-            code = refuse(verb, error)
+            code = refuse(name, error)
         outcomes = read_outcomes(journal)
         if outcomes and code != PIPE_CLOSED:
-            code = conclude(verb, outcomes) or code
+            code = conclude(name, verb, outcomes) or code
     sys.exit(code)
 
 
-def conclude(verb: str, outcomes: list[Outcome]) -> int:
+def conclude(name: str, verb: Verb, outcomes: list[Outcome]) -> int:
     """Says what became of a multirun's jobs and calls the verb's ``then`` for those that finished; the exit code."""
     print(summarise(outcomes), file=sys.stderr)
     states = {State(outcome.state) for outcome in outcomes} - {State.finished}
@@ -123,17 +133,17 @@ def conclude(verb: str, outcomes: list[Outcome]) -> int:
         return STOPPED
     code = 2 if states else 0
     finished = [outcome.settings for outcome in outcomes if outcome.state == State.finished.value]
-    if VERBS[verb].then and finished:
+    if verb.then and finished:
         jobs = [settings_from_dict(settings_class(verb), settings) for settings in finished]
         try:
-            report.info("%s: %s", verb, resolve(VERBS[verb].then)(jobs))
+            report.info("%s: %s", name, resolve(verb.then)(jobs))
         except AvatarError as error:
-            code = refuse(verb, error)
+            code = refuse(name, error)
     return code
 
 
 @prepared_process()
-def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: Path, parent: int) -> None:
+def run_job(name: str, verb: Verb, run: Callable[[Any], Any], config: DictConfig, journal: Path, parent: int) -> None:
     """One job of a verb, in the ``parent`` process or in one that a launcher started.
 
     In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. The verb's ``then``
@@ -142,12 +152,12 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
     listen_to_verbs(logging.INFO)
     job = HydraConfig.get()
     several = job.mode is RunMode.MULTIRUN
-    name = " ".join([verb, *OmegaConf.to_container(job.overrides.task, resolve=False)])
+    line = " ".join([name, *OmegaConf.to_container(job.overrides.task, resolve=False)])
 
     def end(state: State, why: str, code: int) -> None:
-        print(f"{name}: {why}", file=sys.stderr)
+        print(f"{line}: {why}", file=sys.stderr)
         if several:
-            note_outcome(journal, job.job.num, name, state, why)
+            note_outcome(journal, job.job.num, line, state, why)
         if not several or (state is State.stopped and os.getpid() == parent):
             sys.exit(code)
 
@@ -156,16 +166,16 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
     if several and current_world().size > 1:
         return end(State.failed, "torchrun trains one run; leave out either it or --multirun.", 2)
     if several:
-        note_outcome(journal, job.job.num, name, State.running)
+        note_outcome(journal, job.job.num, line, State.running)
     try:
         settings = to_settings(settings_class(verb), config)
         with leave_when_asked():
             WORK.clear()
             started = time.monotonic()
             result = run(settings)
-            report_ending(verb, settings, result, time.monotonic() - started)
-            if VERBS[verb].then and not several and current_world().is_main:
-                report.info("%s: %s", verb, resolve(VERBS[verb].then)([settings]))
+            report_ending(name, settings, result, time.monotonic() - started)
+            if verb.then and not several and current_world().is_main:
+                report.info("%s: %s", name, resolve(verb.then)([settings]))
     except Stopped as stopped:
         return end(State.stopped, str(stopped), STOPPED)
     except SystemExit as leaving:
@@ -175,7 +185,7 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
     except AvatarError as error:
         return end(State.failed, str(error), 2)
     except OmegaConfBaseException as error:
-        return end(State.failed, explain(error, verb, sys.argv[1:], CONF), 2)
+        return end(State.failed, explain(error, name, sys.argv[1:], CONF), 2)
     except Exception as error:
         if isinstance(error, BrokenPipeError) and silence_closed_streams():
             sys.exit(PIPE_CLOSED)
@@ -184,7 +194,7 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
         traceback.print_exc()
         return end(State.failed, f"{type(error).__name__}: {error}", 1)
     if several:
-        note_outcome(journal, job.job.num, name, State.finished, settings=settings_to_dict(settings))
+        note_outcome(journal, job.job.num, line, State.finished, settings=settings_to_dict(settings))
     return None
 
 

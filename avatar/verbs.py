@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 
@@ -15,13 +16,15 @@ class Verb:
     """One verb: a sentence for the user, then ``module:attribute`` of its function and of its settings class.
 
     A verb without a settings class reads its own arguments; ``then`` is called with the settings of a multirun's
-    finished jobs.
+    finished jobs; ``conf`` is the verb's configuration file where that is not ``conf/<verb>.yaml``, as for the verbs
+    of ``tools/`` that are not in the package and so not in `VERBS`.
     """
 
     does: str
     run: str
     settings: str = ""
     then: str = ""
+    conf: Path | None = None
 
 
 VERBS = {
@@ -80,16 +83,6 @@ VERBS = {
     "report": Verb("writes a run's page", "avatar.pipeline.reporting:report", "avatar.pipeline.reporting:ReportConfig"),
     "demo": Verb(
         "does the main job on the embedded sample", "avatar.pipeline.demo:demo", "avatar.pipeline.demo:DemoConfig"
-    ),
-    "bench": Verb(
-        "measures speed and memory",
-        "avatar.pipeline.benchmarks.bench:bench",
-        "avatar.pipeline.benchmarks.bench:BenchConfig",
-    ),
-    "torture": Verb(
-        "measures reliability under kills, damage and races",
-        "avatar.pipeline.torture.trials:torture",
-        "avatar.pipeline.torture.trials:TortureConfig",
     ),
     "parameters": Verb(
         "counts every method's parameters",

@@ -94,7 +94,7 @@ SHORT = {
         *(f"canonicalizer.{option}" for option in CANONICALIZER),
     ),
     "bench": ("quick=true", "repeats=1", "memory=false"),
-    "torture": ("only=[fuzz]", "files=50"),
+    "check_reliability": ("only=[fuzz]", "files=50"),
 }
 
 # And fewer jobs of an experiment: test_configs.py composes them all.
@@ -126,7 +126,7 @@ PROMISED = {
     "demo": ["runs/demo/summary.json", "runs/closet/sample/{outfit}/demo/report.html"],
     "simulate": ["data/open/*/manifest.json"],
     "bench": ["**/bench.csv", "**/bench.md"],
-    "torture": ["**/reliability.csv"],
+    "check_reliability": ["**/reliability.csv"],
     "parameters": ["**/parameters.csv", "**/parameters.md"],
     "convert_body": ["{1}"],
     "make_body": ["{0}"],
@@ -163,11 +163,11 @@ class Outcome:
 
 
 def printed_commands() -> list[Printed]:
-    """Every command line of README.md, docs/, the first comment of each file in conf/, and the tools' own help."""
+    """Every command line of README.md, docs/, the first comments of configuration files, and the tools' own help."""
     found = []
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         found += commands_of_document(path.read_text(), str(path.relative_to(ROOT)))
-    for path in sorted((ROOT / "conf").rglob("*.yaml")):
+    for path in sorted([*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "tools").rglob("*.yaml")]):
         comments = [line[2:] for line in path.read_text().splitlines()[:2] if line.startswith("# ")]
         found += [Printed(line, str(path.relative_to(ROOT))) for line in comments if COMMAND.match(line)]
     for path in sorted((ROOT / "tools").glob("*.py")):

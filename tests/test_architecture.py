@@ -1,7 +1,8 @@
-"""The arrows of docs/design.md, read from the imports, and what no file of the package may do.
+"""The layers of docs/design.md, read from the imports, and what no file of the package may do.
 
-A room may import itself and the rooms below it. Rooms of one layer may import each other, but in layer 3, where
-they are strangers; no arrow may close a circle of modules.
+A subpackage may import itself and those in lower layers. Those of one layer may import each other, but not in layer 3;
+no imports may close a circle of modules. The packages of `tools/` may import the package, which
+imports none of them.
 """
 
 import ast
@@ -13,6 +14,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "avatar"
+TOOLS = ROOT / "tools"
+OUTSIDE = {path.stem for path in TOOLS.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
 LAYERS = {
     "records": 0,
     "checks": 0,
@@ -22,6 +25,7 @@ LAYERS = {
     "progress": 0,
     "processes": 0,
     "verbs": 0,
+    "world": 0,
     "geometry": 1,
     "io": 2,
     "body": 2,
@@ -30,19 +34,22 @@ LAYERS = {
     "canonical": 3,
     "nn": 3,
     "implicit": 3,
-    "training": 4,
-    "export": 4,
-    "evaluation": 4,
-    "pipeline": 5,
-    "config": 6,
-    "arguments": 6,
-    "cli": 6,
-    "__main__": 6,
-    "plain_verbs": 6,
+    "methods": 4,
+    "training": 5,
+    "export": 5,
+    "evaluation": 5,
+    "runs": 6,
+    "pipeline": 7,
+    "config": 8,
+    "arguments": 8,
+    "cli": 8,
+    "__main__": 8,
+    "plain_verbs": 8,
 }
-STRANGERS = 3  # the layer whose rooms do not import each other
-FORBIDDEN = {("evaluation", "nn"), ("evaluation", "training")}
-ONLY_IN = {  # package: the rooms that may name it at all
+SIBLINGS = 3  # the layer whose subpackages do not import each other
+FORBIDDEN = {("evaluation", "nn"), ("evaluation", "methods"), ("evaluation", "training")}
+AVATARS = ("closet", "pop", "scale", "scanimate")  # methods of avatars: each is known to its own file and the registry
+ONLY_IN = {  # package: the subpackages that may name it at all
     "hydra": {"config", "arguments"},
     "omegaconf": {"config", "arguments"},
     "open3d": {"export"},
@@ -65,18 +72,18 @@ TREES = {
 }
 TREE_BUILDERS = {
     "avatar/geometry/trees.py": "the one builder",
-    "avatar/pipeline/benchmarks/search.py": "scipy as it comes is what is measured, on clouds that are always the same",
+    "tools/benchmarks/search.py": "scipy as it comes is what is measured, on clouds that are always the same",
 }
 
 
-def room_of(path: Path) -> str:
-    """The room a file of the package stands in."""
+def package_of(path: Path) -> str:
+    """The subpackage that a file belongs to."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
 def module_of(path: Path) -> str:
-    """The dotted name of a file of the package."""
-    parts = path.relative_to(ROOT).with_suffix("").parts
+    """The dotted name of a file of the package, or of `tools/`."""
+    parts = path.relative_to(TOOLS if path.is_relative_to(TOOLS) else ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
@@ -112,23 +119,45 @@ def sources(*folders: str) -> list[Path]:
     return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
 
 
-def arrow_faults(path: Path, tree: ast.Module) -> list[str]:
-    """Imports of a file of the package that no arrow allows."""
-    room, faults = room_of(path), []
-    if room == "__init__":
+def layer_faults(path: Path, tree: ast.Module) -> list[str]:
+    """Imports of a file of the package that no layer allows."""
+    package, faults = package_of(path), []
+    if package == "__init__":
         names = {name for _, name in imported(tree, "avatar", True)} - {"os", "sys"}
         return [f"avatar/__init__.py imports {name}" for name in sorted(names)]
     for line, name in imported(tree, module_of(path), path.name == "__init__.py"):
         first, _, rest = name.partition(".")
         other = rest.partition(".")[0]
-        if first == "avatar" and other in LAYERS and other != room:
-            up = LAYERS[other] > LAYERS.get(room, 0)
-            strange = LAYERS[other] == LAYERS.get(room, 0) == STRANGERS
-            if up or strange or (room, other) in FORBIDDEN:
-                faults.append(f"{path.relative_to(ROOT)}:{line}: {room} imports {name}")
-        if first in ONLY_IN and room not in ONLY_IN[first]:
-            faults.append(f"{path.relative_to(ROOT)}:{line}: {room} imports {first}")
+        if first == "avatar" and other in LAYERS and other != package:
+            up = LAYERS[other] > LAYERS.get(package, 0)
+            sibling = LAYERS[other] == LAYERS.get(package, 0) == SIBLINGS
+            if up or sibling or (package, other) in FORBIDDEN:
+                faults.append(f"{path.relative_to(ROOT)}:{line}: {package} imports {name}")
+        if first in OUTSIDE or (first in ONLY_IN and package not in ONLY_IN[first]):
+            faults.append(f"{path.relative_to(ROOT)}:{line}: {package} imports {first}")
     return faults
+
+
+def method_branches(tree: ast.Module, module: str) -> list[tuple[int, str]]:
+    """Line and description of all that depends on which method a run has: imports of methods, names, types."""
+    own = module.rpartition(".")[2]
+    found = [
+        (line, name)
+        for line, name in imported(tree, module, False)
+        for avatar in AVATARS
+        if avatar != own and f"{name}.".startswith(f"avatar.methods.{avatar}.")
+    ]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Compare):
+            constants = [side.value for side in (node.left, *node.comparators) if isinstance(side, ast.Constant)]
+            found += [(node.lineno, f"compares with {value!r}") for value in constants if value in AVATARS]
+            if any(name_of(side).endswith("method.name") for side in (node.left, *node.comparators)):
+                found.append((node.lineno, "compares method.name"))
+        elif isinstance(node, ast.Call) and name_of(node.func) in ("isinstance", "hasattr", "getattr"):
+            asked = name_of(node.args[0]).rpartition(".")[2]
+            if asked in ("model", "method") and not module.startswith("avatar.methods."):
+                found.append((node.lineno, f"{name_of(node.func)} of a network"))
+    return found
 
 
 def careless_calls(tree: ast.Module) -> list[tuple[int, str]]:
@@ -161,19 +190,41 @@ def careless_calls(tree: ast.Module) -> list[tuple[int, str]]:
     return found
 
 
-def test_every_room_has_its_layer():
-    rooms = {room_of(path) for path in sources("avatar")} - {"__init__", "assets"}
-    assert rooms <= set(LAYERS), f"give a layer to {rooms - set(LAYERS)}"
+def test_every_subpackage_has_its_layer():
+    packages = {package_of(path) for path in sources("avatar")} - {"__init__", "assets"}
+    assert packages <= set(LAYERS), f"give a layer to {packages - set(LAYERS)}"
 
 
 @pytest.mark.parametrize("path", sources("avatar"), ids=lambda path: str(path.relative_to(ROOT)))
 def test_imports_point_down(path):
-    assert arrow_faults(path, parse(path)) == []
+    assert layer_faults(path, parse(path)) == []
+
+
+@pytest.mark.parametrize("path", sources("avatar"), ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_file_asks_which_method_it_has(path):
+    if module_of(path) != "avatar.methods.registry":
+        assert method_branches(parse(path), module_of(path)) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "fault"),
+    [
+        ("avatar.runs.new", "from avatar.methods.pop import PopAvatar", True),
+        ("avatar.methods.pop", "from avatar.methods.pop import PopAvatar", False),
+        ("avatar.runs.new", "if config.method.name == name: pass", True),
+        ("avatar.runs.new", "if kind == 'scanimate': pass", True),
+        ("avatar.runs.new", "if hasattr(avatar.model, 'garment_template'): pass", True),
+        ("avatar.runs.new", "if isinstance(model, Network): pass", True),
+        ("avatar.runs.new", "if avatar.method.makes_meshes: pass", False),
+    ],
+)
+def test_branches_on_a_method_are_seen(module, line, fault):
+    assert bool(method_branches(ast.parse(line), module)) == fault
 
 
 def test_no_circle_of_modules():
     """Imports at the top of a file must have an order; those inside functions wait until all is loaded."""
-    modules = {module_of(path): path for path in sources("avatar")}
+    modules = {module_of(path): path for path in sources("avatar", "tools")}
     waiting = {}
     for module, path in modules.items():
         top = ast.Module([node for node in parse(path).body if isinstance(node, (ast.Import, ast.ImportFrom))], [])
@@ -279,10 +330,12 @@ def test_trees_are_seen(line, fault):
         ("training/new.py", "import omegaconf", True),
         ("evaluation/new.py", "require('open3d')", True),
         ("__init__.py", "import torch", True),
+        ("pipeline/new.py", "from reliability.small_jobs import train_job", True),
+        ("export/new.py", "import benchmarks.search", True),
     ],
 )
-def test_arrows_are_seen(file, line, fault):
-    assert bool(arrow_faults(PACKAGE / file, ast.parse(line))) == fault
+def test_imports_that_point_up_are_seen(file, line, fault):
+    assert bool(layer_faults(PACKAGE / file, ast.parse(line))) == fault
 
 
 def in_fresh_python(code: str) -> str:
@@ -299,7 +352,7 @@ def test_import_of_the_package_imports_nothing_else():
 
 
 def test_no_module_but_those_of_the_command_line_imports_a_heavy_or_optional_package():
-    modules = [module_of(path) for path in sources("avatar") if room_of(path) not in ("config", "arguments")]
+    modules = [module_of(path) for path in sources("avatar") if package_of(path) not in ("config", "arguments")]
     modules.sort(key=lambda module: module in KERNELS)  # last, for what it loads would hide what others do
     code = (
         "import importlib, sys\n"

@@ -19,33 +19,40 @@ from avatar.config import compose_settings as load
 from avatar.methods.registry import find_method
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.verbs import VERBS
+from benchmarks import BENCH
+from reliability import CHECK_RELIABILITY
 
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SIZES = sorted(path.stem for path in (CONF / "size").glob("*.yaml"))
-WITH_SETTINGS = [verb for verb, entry in VERBS.items() if entry.settings]
+WITH_SETTINGS = {name: verb for name, verb in VERBS.items() if verb.settings}
+WITH_SETTINGS |= {"bench": BENCH, "check_reliability": CHECK_RELIABILITY}
 
 
-@pytest.mark.parametrize("verb", WITH_SETTINGS)
-def test_every_verb_composes_and_has_its_tool(verb):
-    assert type(load(verb)) is settings_class(verb)
-    assert (ROOT / "tools" / f"{verb}.py").is_file()
-    assert (CONF / f"{verb}.yaml").read_text().startswith(f"# python tools/{verb}.py")
+@pytest.mark.parametrize("name", WITH_SETTINGS)
+def test_every_verb_composes_and_has_its_tool(name):
+    verb = WITH_SETTINGS[name]
+    assert type(load(name, verb=verb)) is settings_class(verb)
+    assert (ROOT / "tools" / f"{name}.py").is_file()
+    assert (verb.conf or CONF / f"{name}.yaml").read_text().startswith(f"# python tools/{name}.py")
 
 
-@pytest.mark.parametrize("verb", WITH_SETTINGS)
-def test_no_option_of_a_verb_is_taken_for_a_choice_among_files(verb):
+@pytest.mark.parametrize("name", WITH_SETTINGS)
+def test_no_option_of_a_verb_is_taken_for_a_choice_among_files(name):
     """An option with the name of a folder of `conf/` chooses one of its files, whatever verb it is given to."""
-    chosen = {str(name) for entry in yaml.safe_load((CONF / f"{verb}.yaml").read_text())["defaults"] for name in entry}
+    verb = WITH_SETTINGS[name]
+    defaults = yaml.safe_load((verb.conf or CONF / f"{name}.yaml").read_text())["defaults"]
+    chosen = {str(key) for entry in defaults for key in entry}
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
     assert groups & settings_to_dict(settings_class(verb)()).keys() <= chosen
 
 
-@pytest.mark.parametrize("verb", WITH_SETTINGS)
-def test_every_verb_writes_below_the_roots_of_runs_and_data_unless_told_otherwise(verb):
+@pytest.mark.parametrize("name", WITH_SETTINGS)
+def test_every_verb_writes_below_the_roots_of_runs_and_data_unless_told_otherwise(name):
     """Trying something must not overwrite the published tables, nor anything else of the folder it is tried in."""
-    assert [(name, str(path)) for name, path in paths_of(load(verb)) if path.parts[0] not in ("runs", "data")] == []
+    paths = paths_of(load(name, verb=WITH_SETTINGS[name]))
+    assert [(option, str(path)) for option, path in paths if path.parts[0] not in ("runs", "data")] == []
 
 
 def paths_of(settings: Any, prefix: str = "") -> Iterator[tuple[str, Path]]:

@@ -1,4 +1,4 @@
-"""Every command line of README.md, docs/, conf/ and the tools' help, as a process of its own, as printed, on tiny data.
+"""Every command line of README.md, docs/, conf/ and tools/, as a process of its own, as printed, on tiny data.
 
 From another folder, without a terminal, with the flags that commands set. Placeholders are filled in and work is made
 less (`documented.FILLED`, `documented.SHORT`); nothing else is changed. What is not run is named in `NOT_RUN`.
@@ -57,7 +57,7 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         "python tools/demo.py",
     ),
 )
-SLOW = {"experiment": 25, "bench": 20, "torture": 10, "demo": 25, "doctor": 30}  # seconds; 6 for other verbs
+SLOW = {"experiment": 25, "bench": 20, "check_reliability": 10, "demo": 25, "doctor": 30}  # seconds; 6 for other verbs
 PRINTED = printed_commands()
 
 

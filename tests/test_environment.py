@@ -11,12 +11,14 @@ import pytest
 
 from avatar.environment import inspect_package, mending_line
 from avatar.invocation import interpreter
-from avatar.pipeline.torture.miniature import weights_digest, write_data
 from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
 from avatar.runs.fitting import fit_outfit
 from avatar.runs.prediction import predict_frames, predict_motion
 from avatar.runs.training import train as train_run
 from avatar.verbs import VERBS, resolve
+from benchmarks import BENCH
+from reliability import CHECK_RELIABILITY
+from reliability.small_jobs import weights_digest, write_data
 
 ROOT = Path(__file__).parents[1]
 TWO_THREADS = {"OMP_NUM_THREADS": "2"}
@@ -79,7 +81,7 @@ def test_every_verb_keeps_freed_memory_for_what_comes_next():
         "    for _ in range(3): torch.ones(1 << 24)\n"
         "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before\n"
         "print(min(faults() for _ in range(8)))\n"
-        "command('bench', lambda config: print(min(faults() for _ in range(8))) or [])"
+        "command('parameters', lambda config: print(min(faults() for _ in range(8))) or [])"
     )
     thrown_away, kept = map(int, in_fresh_python(code).stdout.split())
     assert thrown_away > 3 * 10_000 and kept < 1000
@@ -100,7 +102,7 @@ def test_every_verb_takes_the_smallest_numbers_for_zero_in_all_threads():
     code = LEFT + (
         "from avatar.config import command\n"
         "print(left())\n"
-        "try: command('bench', lambda config: print(left()) or [])\n"
+        "try: command('parameters', lambda config: print(left()) or [])\n"
         "except SystemExit: print(left())"
     )
     assert in_fresh_python(code, **TWO_THREADS).stdout.split() == [str(1 << 20), "0", str(1 << 20)]
@@ -150,6 +152,7 @@ def test_all_that_verbs_and_callers_of_the_package_start_prepares_the_process():
     started = [train_run, train_canonicalizer, canonicalize_frames, fit_outfit]
     started += [predict_frames, predict_motion]
     started += [resolve(verb.run) for name, verb in VERBS.items() if verb.settings and name != "parameters"]
+    started += [resolve(verb.run) for verb in (BENCH, CHECK_RELIABILITY)]
     assert len(started) > 20
     bare = [f.__qualname__ for f in started if not inspect.getsource(f).startswith("@prepared_process()")]
     assert bare == []

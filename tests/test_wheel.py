@@ -56,6 +56,16 @@ def test_an_installed_wheel_has_its_assets(environment, tmp_path):
 
 
 @pytest.mark.slow
+def test_an_installed_wheel_holds_no_benchmarks_nor_reliability_tests(environment, tmp_path):
+    (site,) = environment.parents[1].glob("lib/python*/site-packages")
+    names = {path.name for path in site.rglob("*")}
+    assert "train.yaml" in names
+    assert not names & {"benchmarks", "reliability", "bench.yaml", "check_reliability.yaml"}
+    refused = in_wheel(environment, tmp_path, "-m", "avatar", "bench", check=False)
+    assert refused.returncode == 2 and "no verb 'bench'" in refused.stderr
+
+
+@pytest.mark.slow
 def test_an_installed_wheel_names_requirements_and_not_itself(environment, tmp_path):
     code = "from avatar.invocation import install_line; print(install_line('newton'))"
     line = in_wheel(environment, tmp_path, "-c", code).stdout.strip()

@@ -1,6 +1,6 @@
-"""Says how fast it is: python tools/bench.py 'only=[chamfer,step]' repeats=5"""
+"""Measures speed and memory: python tools/bench.py 'only=[chamfer,step]' repeats=5"""
 
 from start import run
 
 if __name__ == "__main__":
-    run("bench")
+    run("bench", "benchmarks:BENCH")

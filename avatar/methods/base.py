@@ -7,7 +7,7 @@ prediction, meshing, evaluation and reports know this interface and no method by
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -49,7 +49,8 @@ class Task(ABC):
 
     ``model`` on its device; ``terms`` the raw loss terms, for the log; ``groups`` the parameter groups; ``stages``;
     ``frames`` the number of training frames; ``batch`` frames a step; ``criterion``, the logged value that the best
-    checkpoint has the least of; ``label`` of the progress bar.
+    checkpoint has the least of; ``label`` of the progress bar; ``replicated``, the names of submodules that every rank
+    runs on the same inputs, so that their normalisations need no synchronisation.
     """
 
     model: nn.Module
@@ -60,6 +61,7 @@ class Task(ABC):
     batch: int
     criterion: str = ""
     label: str = "train"
+    replicated: Collection[str] = ()
 
     @abstractmethod
     def inputs_at(self, step: int) -> Inputs:

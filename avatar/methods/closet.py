@@ -99,7 +99,7 @@ class ClosetAvatar(nn.Module):
     see the pose, so it runs once an outfit in the batch, whatever the number of frames.
     """
 
-    outfit_modules = ("garment_encoder", "garment_decoder")  # see `distributed.synchronize_norms`
+    outfit_modules = ("garment_encoder", "garment_decoder")  # see `nn.shared_norm.synchronize_norms`
 
     def __init__(self, template: Template, outfits: int, config: ClosetConfig):
         """Builds the network on a body template for a number of outfits."""

@@ -86,6 +86,7 @@ class PointTask(Task):
         codes = [named.pop("codes")] if "codes" in named else []
         self.groups = (list(named.values()), codes)
         self.stages = (Stage(1.0, (config.lr, config.code_lr), config.rate_factor),)
+        self.replicated = getattr(model, "outfit_modules", ())
 
     def inputs_at(self, step: int) -> tuple[Batch, SurfaceSamples]:
         """The batch of a step and its template points."""

@@ -69,7 +69,7 @@ class PopAvatar(nn.Module):
     atlas, so features jump where the atlas is cut, however near two points are on the body.
     """
 
-    outfit_modules = ("garment_encoder", "garment_decoder")  # see `distributed.synchronize_norms`
+    outfit_modules = ("garment_encoder", "garment_decoder")  # see `nn.shared_norm.synchronize_norms`
 
     def __init__(self, template: Template, outfits: int, config: PopConfig):
         """Builds the network on a body template with UV coordinates for a number of outfits."""

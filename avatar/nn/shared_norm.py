@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import torch
@@ -69,18 +70,17 @@ class SharedNorm(_BatchNorm):
         return mean, variance, counts.detach().sum()
 
 
-def synchronize_norms(model: nn.Module) -> None:
+def synchronize_norms(model: nn.Module, replicated: Collection[str] = ()) -> None:
     """Turns the batch normalisations of a model into `SharedNorm`s, in place; names and weights stay the same.
 
-    Those of its ``outfit_modules`` stay as they are: every process runs these modules on all outfits of the step
+    Those of the ``replicated`` submodules stay as they are: every process runs them on all outfits of the step
     (`step_outfits`), so each has the whole batch's statistics by itself.
 
     Raises:
         AvatarError: for a kind of normalisation whose statistics it would not know how to synchronise.
     """
-    alike = getattr(model, "outfit_modules", ())
     for path, parent in list(model.named_modules()):
-        if path.partition(".")[0] in alike:
+        if path.partition(".")[0] in replicated:
             continue
         for name, layer in parent.named_children():
             if not isinstance(layer, _BatchNorm) or isinstance(layer, SharedNorm):

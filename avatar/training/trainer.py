@@ -57,7 +57,7 @@ class Trainer:
         self.device = next(self.model.parameters()).device
         self.world = current_world()
         if self.world.size > 1:
-            synchronize_norms(self.model)
+            synchronize_norms(self.model, task.replicated)
         kept = self.model.state_dict().keys()
         self.statistics = [buffer for name, buffer in self.model.named_buffers() if name in kept]
         groups = [{"params": group, "lr": rate} for group, rate in zip(task.groups, task.stages[0].rates)]

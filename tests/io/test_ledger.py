@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from concurrent_jobs import WAIT, run_at_once
 
 from avatar.checks import DataError
 from avatar.io.file_locks import lock_file
@@ -49,17 +50,10 @@ def test_a_line_that_another_process_left_half_written_takes_no_later_one_with_i
 def test_processes_that_write_at_once_lose_no_line(tmp_path):
     code = (
         "import sys\nfrom pathlib import Path\nfrom avatar.io.ledger import Ledger\n"
-        "who, ledger = sys.argv[1], Ledger(Path(sys.argv[2]))\nsys.stdin.readline()\n"
+        f"who, ledger = sys.argv[1], Ledger(Path(sys.argv[2]))\n{WAIT}"
         "for i in range(150): ledger.record(f'{who}{i}', 'key', note=who * (7000 + 100 * i))"
     )
-    line = [sys.executable, "-c", code]
-    jobs = [subprocess.Popen([*line, who, tmp_path], stdin=subprocess.PIPE, cwd=ROOT, text=True) for who in "abc"]
-    for job in jobs:
-        job.stdin.write("go\n")
-        job.stdin.flush()
-    for job in jobs:
-        job.communicate(timeout=100)
-        assert job.returncode == 0
+    run_at_once(code, [(who, str(tmp_path)) for who in "abc"], timeout=100)
     ledger = Ledger(tmp_path)
     assert {(who, i) for who in "abc" for i in range(150) if ledger.find(f"{who}{i}", "key") is None} == set()
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from avatar.pipeline.torture.miniature import prepare, train_job
+from reliability.small_jobs import prepare, train_job
 
 
 @pytest.fixture(scope="session")

@@ -1,14 +1,12 @@
 """Long work goes on where it stopped: finished pieces are checked by hash and left, damaged ones are done again."""
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from concurrent_jobs import WAIT, run_at_once
 
 from avatar.checks import AvatarError, DataError
 from avatar.evaluation import floors, scoring
@@ -30,9 +28,9 @@ from avatar.pipeline.scores import (
     predict,
 )
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
-from avatar.pipeline.torture.miniature import folder_of, train_job
 from avatar.runs.loading import load_avatar
 from avatar.settings import settings_from_dict
+from reliability.small_jobs import folder_of, train_job
 
 ROOT = Path(__file__).parents[2]
 METRICS = ["cd_point", "normal_l1"]
@@ -156,7 +154,7 @@ def test_floors_keep_the_metrics_and_the_point_counts_of_earlier_tables(run, cou
     capsys.readouterr()
 
 
-FLOORS_JOB = """
+FLOORS_JOB = f"""
 import sys, time
 from pathlib import Path
 from avatar.data.layouts import find_outfit
@@ -174,25 +172,14 @@ def late(*arguments):
     real(*arguments)
 scores.save_scores = late
 config = scores.EvaluateConfig(score=ScoreConfig(scan_points=300, metrics=[metric]))
-print("ready", flush=True)
-sys.stdin.readline()
-scores.score_floors(outfit, config, 500, root / "floors" / "scores.csv")
+{WAIT}scores.score_floors(outfit, config, 500, root / "floors" / "scores.csv")
 """
 
 
 def test_two_processes_that_score_the_same_floors_at_once_lose_nothing(tiny_folder, tmp_path):
     (tmp_path / "data").symlink_to(tiny_folder.parents[1])
     metrics = ("cd_point", "normal_l1")
-    lines = [[sys.executable, "-c", FLOORS_JOB, metric, str(tmp_path), tiny_folder.name] for metric in metrics]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    jobs = [subprocess.Popen(line, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, **pipes) for line in lines]
-    assert [job.stdout.readline() for job in jobs] == ["ready\n"] * 2
-    for job in jobs:
-        job.stdin.write("go\n")
-        job.stdin.flush()
-    for job in jobs:
-        job.communicate(timeout=300)
-        assert job.returncode == 0
+    run_at_once(FLOORS_JOB, [(metric, str(tmp_path), tiny_folder.name) for metric in metrics])
     found = read_scores(tmp_path / "floors" / "scores.csv")
     assert {(row.method, row.metric) for row in found.rows} == {(m, n) for m in ("sampling", "body") for n in metrics}
     assert len(found.frames) == 4 * 3  # three frames

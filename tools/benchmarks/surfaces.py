@@ -1,0 +1,112 @@
+"""Benchmarks beside the point avatars: the canonicalizer's step, surfaces from fields and points, simulated frames."""
+
+from __future__ import annotations
+
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig
+from avatar.canonical.posed import prepare_scan
+from avatar.export.meshing import PoissonConfig, PoissonMesher
+from avatar.implicit.extraction import ExtractionConfig, extract_surface
+from avatar.implicit.sdf import PosedSdf, SdfConfig
+from avatar.methods.canonicalizer import CanonicalizerTask, CycleConfig
+from avatar.records import Mesh, PointCloud
+from avatar.settings import settings_from_dict
+from avatar.simulate.dressing import TravelConfig
+from avatar.simulate.outfits import outfit
+from avatar.simulate.poses import draw_poses
+from avatar.simulate.production import dress
+from avatar.training.feeding import to_device
+from avatar.training.trainer import Trainer
+from benchmarks.avatars import sample_outfit
+from benchmarks.comparisons import Comparison, Job, Run, absence
+
+
+def canonicalizer_comparisons(job: Job) -> list[Comparison]:
+    """A step of the canonicalizer's two stages, at each size."""
+    frames = job.size(4, 2)
+
+    def prepare(label: str, together: bool) -> Run:
+        garment = sample_outfit()
+        options = job.canonicalizers[label]
+        train = settings_from_dict(CycleConfig, options.get("train", {}), f"canonicalizers.{label}.train.")
+        sizes = settings_from_dict(CanonicalizerConfig, options.get("canonicalizer", {}))
+        names = garment.frames("train")[:frames]
+        scans = [prepare_scan(garment.load("train", name), garment.template, train.draw.pool) for name in names]
+        torch.manual_seed(0)
+        model = Canonicalizer(garment.template, frames, sizes).to(job.device)
+        task = CanonicalizerTask(model, garment.template, scans, names, train)
+        trainer = Trainer(task, train, Path("unused"))
+        trainer.step = train.first_steps + 1 if together else 0
+        return lambda: trainer.train_step(to_device(task.inputs_at(trainer.step), trainer.device))
+
+    comparisons = []
+    for label in (label for label in job.canonicalizers if label == "small" or not job.quick):
+        candidates = {"fields apart": partial(prepare, label, False), "together": partial(prepare, label, True)}
+        comparisons.append(Comparison("canonicalizer", label, candidates, "fields apart"))
+    return comparisons
+
+
+def extraction_comparisons(job: Job) -> list[Comparison]:
+    """Zero surface of a signed distance network, evaluated coarse to fine or on the dense grid."""
+    resolution, coarsest = job.size(128, 32), job.size(16, 8)
+
+    def prepare(config: ExtractionConfig) -> Run:
+        torch.manual_seed(0)
+        widths = (64, 64, 64, 64)
+        box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]], device=job.device)
+        sdf = PosedSdf(0, box, SdfConfig(widths=widths, skip=2, orders=0)).to(job.device)
+
+        def field(points: Tensor) -> Tensor:
+            return sdf(points[None], points.new_zeros(1, len(points), 0))[0]
+
+        return lambda: extract_surface(field, box, config).mesh
+
+    def gap(mine: Mesh, baseline: Mesh) -> float:
+        same = mine.vertices.shape == baseline.vertices.shape
+        return float(np.abs(mine.vertices - baseline.vertices).max()) if same else float("inf")
+
+    candidates = {
+        "ours": partial(prepare, ExtractionConfig(resolution, coarsest)),
+        "dense grid": partial(prepare, ExtractionConfig(resolution, resolution)),
+    }
+    return [Comparison("extraction", f"{resolution} cells", candidates, "ours", gap)]
+
+
+def poisson_comparisons(job: Job) -> list[Comparison]:
+    """Meshing a scan in the worker process, by octree depth; the worker's memory is not in the table."""
+    points, depths = job.size(40_000, 3000), job.size(8, 6)
+    if find_spec("open3d") is None:
+        return [Comparison("poisson", f"{points:,} points", {}, "", absent={"depth 8": absence("open3d")})]
+
+    def prepare(depth: int) -> Run:
+        garment = sample_outfit()
+        scan = garment.load("train", garment.frames("train")[0]).scan
+        chosen = np.random.default_rng(0).permutation(len(scan.points))[:points]
+        cloud = PointCloud(scan.points[chosen], scan.normals[chosen])
+        mesher = PoissonMesher(PoissonConfig(depth=depth, max_hole=0.1))
+        return lambda: mesher.mesh(cloud)
+
+    candidates = {f"depth {depth}": partial(prepare, depth) for depth in (depths - 1, depths)}
+    return [Comparison("poisson", f"{points:,} points", candidates, f"depth {depths}", points=points)]
+
+
+def simulation_comparisons(job: Job) -> list[Comparison]:
+    """A settled frame of the tee and of the dress, from the bind pose to rest."""
+    if find_spec("newton") is None:
+        return [Comparison("simulation", "settled frame", {}, "", absent={"newton": absence("newton")})]
+    travel = TravelConfig(stride=0.3, hold=3, least_hold=1) if job.quick else TravelConfig()
+
+    def prepare(name: str) -> Run:
+        dressed = dress(outfit(name), travel)
+        pose = draw_poses(1, 0, "train")[0].pose
+        return lambda: dressed.settle(pose).cloth
+
+    candidates = {name: partial(prepare, name) for name in ("tee", "dress")}
+    return [Comparison("simulation", "settled frame", candidates, "tee")]
