@@ -43,7 +43,7 @@ from avatar.verbs import VERBS, Verb, resolve
 from avatar.world import current_world, torchrun_world
 
 CONF = (checkout() or PACKAGE) / "conf"  # a wheel has it in the package
-METHOD_SETTINGS = "avatar.methods.registry:SETTINGS"
+METHODS = "avatar.methods.registry:METHODS"
 Settings = TypeVar("Settings")
 report = logging.getLogger(__name__)
 
@@ -61,8 +61,8 @@ def register(name: str, verb: Verb | None = None) -> None:
     verb = verb or VERBS[name]
     store, defaults = ConfigStore.instance(), settings_to_dict(settings_class(verb)())
     store.store(name=f"{name}_defaults", node=defaults)
-    for method, kind in resolve(METHOD_SETTINGS).items() if isinstance(defaults.get("method"), dict) else ():
-        store.store(group="method", name=f"{method}_defaults", node={"settings": settings_to_dict(kind())})
+    for method, kind in resolve(METHODS).items() if isinstance(defaults.get("method"), dict) else ():
+        store.store(group="method", name=f"{method}_defaults", node={"settings": settings_to_dict(kind.Settings())})
     if verb.conf:
         store.store(name=name, node=read_yaml(verb.conf))
 

@@ -1,16 +1,28 @@
-"""Registry of the methods by name."""
+"""Registry of the methods by name: every `Method` with a name in the files of this folder."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterator
+
+from avatar import methods
 from avatar.checks import unknown_name
 from avatar.methods.base import Method
-from avatar.methods.closet import Closet
-from avatar.methods.pop import Pop
-from avatar.methods.scale import Scale
-from avatar.methods.scanimate import Scanimate
 
-METHODS: dict[str, Method] = {method.name: method for method in (Closet(), Pop(), Scale(), Scanimate())}
-SETTINGS = {name: method.Settings for name, method in METHODS.items()}
+
+def defined_methods() -> Iterator[Method]:
+    """One of each class of methods that has a name, in the order of their files."""
+    for found in pkgutil.iter_modules(methods.__path__, f"{methods.__name__}."):
+        if found.name != __name__:
+            for kind in vars(importlib.import_module(found.name)).values():
+                named = inspect.isclass(kind) and issubclass(kind, Method) and hasattr(kind, "name")
+                if named and kind.__module__ == found.name:
+                    yield kind()
+
+
+METHODS = {method.name: method for method in defined_methods()}
 
 
 def find_method(name: str) -> Method:
