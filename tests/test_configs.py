@@ -80,6 +80,42 @@ def test_every_method_and_size_gives_its_settings(method, size):
         assert settings.code_channels == {"full": 64, "small": 16}[size]
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("size", SIZES)
+def test_no_size_overwrites_what_a_method_or_its_variant_fixes(method, size):
+    composed = settings_to_dict(load("train", f"method={method}", f"size={size}"))
+    for name, value in fixed_values(method).items():
+        found: Any = composed
+        for part in name.split("."):
+            found = found[part]
+        assert found == value, name
+
+
+def fixed_values(method: str) -> dict[str, Any]:
+    """The options that a method's file sets, and those of the method that it is a variant of, by full name."""
+    plain = yaml.safe_load((CONF / "method" / f"{method}.yaml").read_text())
+    included = [name for name in plain.pop("defaults") if isinstance(name, str) and "@" not in name]
+    values = {name: value for base in included for name, value in fixed_values(base).items()}
+    return values | dict(leaves(plain))
+
+
+def leaves(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested options by their full names."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def test_a_loss_weight_that_a_paper_fixes_is_set_in_one_place():
+    """Of the files that methods are composed of; `size/small.yaml` has a CPU's own for all methods."""
+    files = [path for group in ("method", "method_size") for path in (CONF / group).glob("*.yaml")]
+    plain = [leaves(yaml.safe_load(path.read_text()) or {}) for path in files]
+    weights = [(name, value) for values in plain for name, value in values if ".loss." in name and value != "plane"]
+    assert len(set(weights)) == len(weights) > 0
+
+
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes_and_says_how_to_run_it(experiment):
     config = load("experiment", f"experiment={experiment}")
