@@ -136,6 +136,18 @@ class Method(ABC):
     on_body: ClassVar[bool] = False
     static: ClassVar[Mapping[str, Any] | None] = None
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Modules of this package whose code makes the method's predictions, for `io.ledger`."""
+        return (type(self).__module__,)
+
+    def check(self, run: RunConfig, settings: Any) -> None:  # noqa: B027 (nothing to check by default)
+        """Check a run before its data are read.
+
+        Raises:
+            AvatarError: for a run that the method cannot train, such as several outfits where it takes one.
+        """
+
     def needs(self, run: RunConfig, settings: Any) -> frozenset[str]:
         """What must be made of the outfits before training: any of {`CANONICALIZER`}."""
         return frozenset()
@@ -145,7 +157,7 @@ class Method(ABC):
         """An untrained network with its data and loss, on the run's device.
 
         Raises:
-            AvatarError: for a run that the method cannot train, such as several outfits where it takes one.
+            DataError: when something the method needs is missing, naming the command that makes it.
         """
 
     @abstractmethod

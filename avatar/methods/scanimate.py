@@ -147,15 +147,15 @@ class Scanimate(Method):
     def needs(self, run: RunConfig, settings: ScanimateConfig) -> frozenset[str]:
         return frozenset({CANONICALIZER})
 
-    def prepare(self, run: RunConfig, settings: ScanimateConfig, template: Template) -> ImplicitTask:
-        """As `Method.prepare`. Raises `DataError` without canonical scans, naming the command that makes them."""
+    def check(self, run: RunConfig, settings: ScanimateConfig) -> None:
         require_single_process(self.name)
-        train = run.train
-        if train.precision is not Precision.fp32:
-            raise AvatarError(f"train.precision: expected fp32 for {self.name}, got {train.precision.value}.")
+        if run.train.precision is not Precision.fp32:
+            raise AvatarError(f"train.precision: expected fp32 for {self.name}, got {run.train.precision.value}.")
         if len(run.outfit) != 1:
             raise AvatarError(f"outfit: {self.name} learns one outfit at a time, got {', '.join(run.outfit)}.")
-        outfits = run.outfits()
+
+    def prepare(self, run: RunConfig, settings: ScanimateConfig, template: Template) -> ImplicitTask:
+        outfits, train = run.outfits(), run.train
         outfit = canonical_outfits(run.runs_root, outfits, run.canonical)[0]
         skinning = find_field(canonicalizer_folder(run.runs_root, outfits[0], run.canonical), template)
         split = split_outfit(outfit, run.split)

@@ -101,7 +101,7 @@ def predict_poses(
     surface = surface or ExtractionConfig()
     dress = avatar.method.predictor(avatar, outfit, points, surface)
     made = {"avatar": avatar_digest(avatar), **avatar.method.prediction_settings(points, surface)}
-    source = (*SOURCE, type(avatar.method).__module__)
+    source = (*SOURCE, *avatar.method.sources)
     written, done = [], Ledger(folder)
     for pose in tracked(list(poses), f"predict {outfit}"):
         path, key = folder / f"{pose.name}.ply", keyed(source, **made, body=pose.digest)

@@ -38,6 +38,7 @@ def train(config: RunConfig) -> Path:
     method = find_method(config.method.name)
     settings = settings_from_dict(method.Settings, config.method.settings, "method.settings.")
     config = replace(config, method=replace(config.method, settings=settings_to_dict(settings)))
+    method.check(config, settings)
     template, world = mean_template([outfit.template for outfit in config.outfits()]), current_world()
     task = method.prepare(config, settings, template)
     with lock_folder(config.folder) if world.is_main else nullcontext():

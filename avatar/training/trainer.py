@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, DataError
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
 from avatar.methods.base import Inputs, Position, Task
@@ -224,7 +224,7 @@ class Trainer:
         """Goes back to the newest valid checkpoint; seeds the random state when there is none.
 
         Raises:
-            AvatarError: for a checkpoint of an earlier version's trainer.
+            DataError: for a checkpoint of an earlier version's trainer, or of another run.
         """
         world, folder = self.world, self.folder / "checkpoints"
         state = broadcast(load_checkpoint(folder) if world.is_main else None, world)
@@ -234,9 +234,10 @@ class Trainer:
             self.model.load_state_dict(broadcast(weights, world))
             return
         if state.get("format") != FORMAT:
-            raise AvatarError(
-                f"{folder}: expected a checkpoint of format {FORMAT}, got {state.get('format', 1)}, of an earlier "
-                "version. Hint: train it anew under another name (name=...); finished weights are still read."
+            raise DataError(
+                folder,
+                f"expected checkpoints of format {FORMAT}, got {state.get('format', 1)}, of an earlier version.",
+                "Train it anew under another name (name=...); finished weights are still read.",
             )
         with restoring(folder):
             self.restore(state)

@@ -30,6 +30,7 @@ from avatar.pipeline.scores import (
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
 from avatar.runs.loading import load_avatar
 from avatar.settings import settings_from_dict
+from avatar.training.trainer import FORMAT
 from reliability.small_jobs import folder_of, train_job
 
 ROOT = Path(__file__).parents[2]
@@ -64,7 +65,7 @@ def test_predict_mesh_and_evaluate_do_what_is_missing_or_damaged_and_nothing_els
     points, frames = {"points": 1500, "device": "cpu"}, 2
     (folder,) = predict(PredictConfig(run=run, **points))
     clouds = sorted(folder.glob("*.ply"))
-    calls = count(points, "predict")
+    calls = count(point_methods, "predict")
     predict(PredictConfig(run=run, **points))
     assert calls == []
     sound = spoil(clouds[1])
@@ -240,6 +241,9 @@ def test_a_checkpoint_that_does_not_fit_is_one_error(run):
     root = run.parents[4]
     folder = folder_of("closet", root, "forged")
     for number, state in enumerate(({"model": {}, "step": 3}, {"model": 5}, {})):
-        save_checkpoint(folder / "checkpoints", state, number + 1)
+        save_checkpoint(folder / "checkpoints", state | {"format": FORMAT}, number + 1)
         with pytest.raises(DataError, match="do not fit this run"):
             train_job("closet", root, "forged")
+    save_checkpoint(folder / "checkpoints", {"model": {}, "step": 3}, 4)
+    with pytest.raises(DataError, match="expected checkpoints of format 2, got 1.*another name"):
+        train_job("closet", root, "forged")

@@ -14,7 +14,7 @@ from torch import nn
 from avatar.checks import AvatarError
 from avatar.io.checkpoints import load_checkpoint
 from avatar.methods.canonicalizer import CanonicalizeConfig
-from avatar.methods.settings import RunConfig
+from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.nn.shared_norm import synchronize_norms
 from avatar.runs.canonicalizing import train_canonicalizer
 from avatar.runs.training import train as train_run
@@ -97,30 +97,30 @@ def test_a_bad_frame_of_one_process_costs_all_the_step_and_no_more(two):
     assert not any(map(math.isfinite, broken)) and sound[0] == sound[1] and math.isfinite(sound[0])
 
 
-def test_a_process_alone_is_a_team_of_one(monkeypatch):
+def test_a_process_alone_is_a_world_of_one(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "1")
     monkeypatch.setenv("LOCAL_RANK", "0")
-    with torchrun_world() as team:
-        assert team == current_world() == World(0, 1)
-    assert team.is_main and team.share(3) == slice(0, 3)
+    with torchrun_world() as world:
+        assert world == current_world() == World(0, 1)
+    assert world.is_main and world.shard(3) == slice(0, 3)
     values = [torch.tensor([2.0])]
-    average(values, team)
-    assert values[0] == 2 and gather("a", team) == ["a"] and broadcast("b", team) == "b"
+    average(values, world)
+    assert values[0] == 2 and gather("a", world) == ["a"] and broadcast("b", world) == "b"
 
 
 def test_what_trains_in_one_process_refuses_several(monkeypatch):
     monkeypatch.setattr("avatar.world.current_world", lambda: World(1, 2))
     with pytest.raises(AvatarError, match=r"scanimate: expected one process, got 2.*without torchrun"):
-        train_run(RunConfig())
+        train_run(RunConfig(method=MethodChoice("scanimate")))
     with pytest.raises(AvatarError, match=r"canonicalizer: expected one process, got 2.*without torchrun"):
         train_canonicalizer(CanonicalizeConfig())
 
 
 def test_shares_cover_the_batch_and_must_be_even():
-    rows = [list(range(12))[World(rank, 3).share(12)] for rank in range(3)]
+    rows = [list(range(12))[World(rank, 3).shard(12)] for rank in range(3)]
     assert rows == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]]
     with pytest.raises(AvatarError, match="batch: expected a multiple of the 2 processes, got 3"):
-        World(0, 2).share(3)
+        World(0, 2).shard(3)
 
 
 def test_norms_of_another_kind_are_refused():
