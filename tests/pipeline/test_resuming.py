@@ -17,6 +17,7 @@ from avatar.export import meshing
 from avatar.export.meshing import PoissonConfig
 from avatar.io.checkpoints import save_checkpoint
 from avatar.io.points import read_points, write_points
+from avatar.methods import points as point_methods
 from avatar.methods.settings import RunConfig
 from avatar.pipeline.scores import (
     EvaluateConfig,
@@ -245,5 +246,5 @@ def test_a_checkpoint_that_does_not_fit_is_one_error(run):
         with pytest.raises(DataError, match="do not fit this run"):
             train_job("closet", root, "forged")
     save_checkpoint(folder / "checkpoints", {"model": {}, "step": 3}, 4)
-    with pytest.raises(DataError, match="expected checkpoints of format 2, got 1.*another name"):
+    with pytest.raises(DataError, match=r"expected checkpoints of format 2, got 1.*another name"):
         train_job("closet", root, "forged")
