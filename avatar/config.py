@@ -62,7 +62,12 @@ def register(name: str, verb: Verb | None = None) -> None:
     store, defaults = ConfigStore.instance(), settings_to_dict(settings_class(verb)())
     store.store(name=f"{name}_defaults", node=defaults)
     for method, kind in resolve(METHODS).items() if isinstance(defaults.get("method"), dict) else ():
-        store.store(group="method", name=f"{method}_defaults", node={"settings": settings_to_dict(kind.Settings())})
+        options = settings_to_dict(kind.Settings())
+        store.store(group="method", name=f"{method}_defaults", node={"settings": options})
+        if not (CONF / "method" / f"{method}.yaml").is_file():  # a method that fixes nothing needs no file there
+            node = {"name": method, "variant": method, "settings": options}
+            node = {"defaults": [{"/size": "small"}, "_self_"], "method": node}
+            store.store(group="method", name=method, node=node, package="_global_")
     if verb.conf:
         store.store(name=name, node=read_yaml(verb.conf))
 

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from runs.test_runs import distance
 from tiny import SETTINGS, quick_training
-from training.test_runs import distance
 
 from avatar.data.batches import FrameDataset, FrameName
 from avatar.data.layouts import find_outfit

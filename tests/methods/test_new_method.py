@@ -9,6 +9,7 @@ import torch
 from tiny import quick_training
 from torch import Tensor, nn
 
+from avatar.config import compose_settings
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
@@ -148,6 +149,12 @@ def test_a_mesh_regression_is_trained_resumed_predicted_and_scored(run):
     first, *_, last = (float(row["distance"]) for row in read_log(folder / "metrics.csv") if row["split"] == "train")
     assert last < 0.7 * first
     assert np.isfinite(read_points(next(clouds.glob("*.ply"))).points).all()
+
+
+def test_the_command_line_composes_it_without_a_file_in_conf(run):
+    settings = compose_settings("train", "method=mesh_regression", "size=full", "method.settings.scale=0.2")
+    assert (settings.method.name, settings.method.variant) == ("mesh_regression", "mesh_regression")
+    assert settings.method.settings == {"scale": 0.2} and settings.train.points == 50_000
 
 
 def test_a_mesh_regression_resumes_to_the_bit(run):

@@ -9,7 +9,6 @@ import torch
 from torch import nn
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-sys.path.insert(0, str(Path(__file__).parents[1] / "nn"))
 from cut_sphere import ATLASED
 from spheres import ENCODER, TEMPLATE, random_batch, small_config
 
