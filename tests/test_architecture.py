@@ -41,6 +41,7 @@ LAYERS = {
     "runs": 6,
     "pipeline": 7,
     "config": 8,
+    "api": 8,
     "arguments": 8,
     "cli": 8,
     "__main__": 8,
