@@ -12,6 +12,7 @@ import os
 import select
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -47,13 +48,8 @@ def run(verb: str) -> NoReturn:
     The code is 0, 2 for bad input or a missing package, 75 after a signal, or 141 where the reader of its output has
     left; faults of the program end in a traceback.
     """
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        os.write(2, f"{verb}: stopped by {signal.Signals(number).name} before it began.\n".encode())
-        os._exit(STOPPED)
-
     for number in (signal.SIGINT, signal.SIGTERM):  # until the verb listens itself
-        signal.signal(number, leave)
+        signal.signal(number, leave_at_once(verb))
     try:
         try:
             start(verb)
@@ -67,6 +63,16 @@ def run(verb: str) -> NoReturn:
         code = PIPE_CLOSED
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done
     sys.exit(code)
+
+
+def leave_at_once(verb: str) -> Callable[[int, FrameType | None], NoReturn]:
+    """What listens to signals while a verb is imported, amid which no exception may be raised."""
+
+    def leave(number: int, frame: FrameType | None) -> NoReturn:
+        os.write(2, f"{verb}: stopped by {signal.Signals(number).name} before it began.\n".encode())
+        os._exit(STOPPED)
+
+    return leave
 
 
 def start(verb: str) -> None:

@@ -2,7 +2,7 @@
 
 Defaults live in the dataclasses alone. Here they become plain nodes that `conf/` builds on, so a misspelt option on
 the command line is refused by Hydra, and one in a file by `settings_from_dict`. Names pick classes from registries;
-a config never names code.
+a config never names code. What a verb does, and torch, is imported once its options are known to be right.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from avatar.arguments import explain, refuse_code, tidy_arguments
-from avatar.checks import AvatarError
-from avatar.cli import refuse, silence_closed_streams
+from avatar.checks import AvatarError, check_trained
+from avatar.cli import leave_at_once, refuse, silence_closed_streams
+from avatar.declared import declared
 from avatar.environment import prepared_process
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
 from avatar.pipeline.endings import report_ending
 from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
 from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.training.distributed import current_team, torchrun_team
-from avatar.training.signals import Stopped, leave_when_asked
-from avatar.verbs import VERBS, resolve
+from avatar.training.signals import Stopped, leave_when_asked, listening
+from avatar.training.teams import current_team, torchrun_team
+from avatar.values import text_options
+from avatar.verbs import METHOD_SETTINGS, VERBS, resolve
 
 CONF = (checkout() or PACKAGE) / "conf"  # a wheel has it in the package
-METHOD_SETTINGS = "avatar.pipeline.methods:SETTINGS"
 Settings = TypeVar("Settings")
 report = logging.getLogger(__name__)
 
@@ -54,10 +55,10 @@ def settings_class(verb: str) -> type:
 
 def register(verb: str) -> None:
     """Stores the defaults of a verb's settings, and of all methods' where it takes one, under ``<name>_defaults``."""
-    store, defaults = ConfigStore.instance(), settings_to_dict(settings_class(verb)())
+    store, defaults = ConfigStore.instance(), settings_to_dict(declared(VERBS[verb].settings)())
     store.store(name=f"{verb}_defaults", node=defaults)
-    for name, kind in resolve(METHOD_SETTINGS).items() if isinstance(defaults.get("method"), dict) else ():
-        store.store(group="method", name=f"{name}_defaults", node={"settings": settings_to_dict(kind())})
+    for name, kind in METHOD_SETTINGS.items() if isinstance(defaults.get("method"), dict) else ():
+        store.store(group="method", name=f"{name}_defaults", node={"settings": settings_to_dict(declared(kind)())})
 
 
 def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
@@ -89,7 +90,7 @@ def command(verb: str, run: Callable[[Any], Any] | None = None) -> None:
     journal = Path("runs/multirun").absolute() / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{os.getpid()}"
     os.environ["AVATAR_MULTIRUN"] = str(journal)  # conf/hydra/quiet.yaml: the launchers' own files go there as well
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on, instead of printing them its way
-    parent, run = os.getpid(), run or resolve(VERBS[verb].run)
+    parent = os.getpid()
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=verb)
     def main(config: DictConfig) -> None:
@@ -100,7 +101,8 @@ def command(verb: str, run: Callable[[Any], Any] | None = None) -> None:
         listen_to_verbs(logging.INFO if team.leads else logging.WARNING)
         try:
             register(verb)
-            sys.argv[1:] = tidy_arguments(sys.argv[1:], sweeps=bool(VERBS[verb].then))
+            texts = text_options(declared(VERBS[verb].settings))
+            sys.argv[1:] = tidy_arguments(sys.argv[1:], bool(VERBS[verb].then), texts)
             refuse_code(sys.argv[1:])
             main()
         except SystemExit as leaving:
@@ -132,8 +134,7 @@ def conclude(verb: str, outcomes: list[Outcome]) -> int:
     return code
 
 
-@prepared_process()
-def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: Path, parent: int) -> None:
+def run_job(verb: str, run: Callable[[Any], Any] | None, config: DictConfig, journal: Path, parent: int) -> None:
     """One job of a verb, in the ``parent`` process or in one that a launcher started.
 
     In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. The verb's ``then``
@@ -158,8 +159,11 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
     if several:
         note_outcome(journal, job.job.num, name, State.running)
     try:
-        settings = to_settings(settings_class(verb), config)
-        with leave_when_asked():
+        check_early(to_settings(declared(VERBS[verb].settings), config))
+        leaving = (signal.SIGINT, signal.SIGTERM) if os.getpid() == parent else ()
+        with listening(leave_at_once(verb), leaving):
+            settings, run = to_settings(settings_class(verb), config), run or resolve(VERBS[verb].run)
+        with leave_when_asked(), prepared_process():
             WORK.clear()
             started = time.monotonic()
             result = run(settings)
@@ -186,6 +190,16 @@ def run_job(verb: str, run: Callable[[Any], Any], config: DictConfig, journal: P
     if several:
         note_outcome(journal, job.job.num, name, State.finished, settings=settings_to_dict(settings))
     return None
+
+
+def check_early(settings: Any) -> None:
+    """Refuses a run that is not there before its verb is imported.
+
+    Raises:
+        DataError: naming the file that is missing.
+    """
+    if isinstance(run := getattr(settings, "run", None), Path):
+        check_trained(run / "avatar")
 
 
 class Lines(logging.StreamHandler):

@@ -1,4 +1,4 @@
-"""The verbs: what each does, the function that does it, and the class of its settings, by name.
+"""The verbs: what each does, the function that does it, and the class of its settings, by name; and those of methods.
 
 Names only, so that starting one verb imports nothing of the others.
 """
@@ -101,6 +101,13 @@ VERBS = {
     "make_motion": Verb("writes one of the open dataset's motions as a file", "avatar.plain_verbs:make_motion"),
     "pack": Verb("writes an outfit as packed frames, as POP's line stores them", "avatar.plain_verbs:pack"),
     "doctor": Verb("lists what is installed and what is missing", "avatar.plain_verbs:doctor"),
+}
+
+METHOD_SETTINGS = {
+    "closet": "avatar.nn.closet:ClosetConfig",
+    "pop": "avatar.nn.baselines.pop:PopConfig",
+    "scale": "avatar.nn.baselines.scale:ScaleConfig",
+    "scanimate": "avatar.training.implicit_runs:ScanimateConfig",
 }
 
 

@@ -8,11 +8,9 @@ from avatar.checks import unknown_name
 from avatar.environment import prepared_process
 from avatar.implicit.avatar import ImplicitAvatar
 from avatar.io.documents import read_yaml
-from avatar.nn.methods import METHODS
-from avatar.training.implicit_runs import METHOD, ScanimateConfig, load_implicit, train_implicit
+from avatar.training.implicit_runs import METHOD, load_implicit, train_implicit
 from avatar.training.runs import RunConfig, TrainedAvatar, load_run, train_run
-
-SETTINGS = {name: method.settings for name, method in METHODS.items()} | {METHOD: ScanimateConfig}
+from avatar.verbs import METHOD_SETTINGS, resolve
 
 
 def find_settings(name: str) -> type:
@@ -21,9 +19,9 @@ def find_settings(name: str) -> type:
     Raises:
         AvatarError: listing the methods there are.
     """
-    if name not in SETTINGS:
-        raise unknown_name("method", name, SETTINGS)
-    return SETTINGS[name]
+    if name not in METHOD_SETTINGS:
+        raise unknown_name("method", name, METHOD_SETTINGS)
+    return resolve(METHOD_SETTINGS[name])
 
 
 @prepared_process()

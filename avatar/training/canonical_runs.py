@@ -12,10 +12,12 @@ from avatar.canonical.fields import SkinningField, SkinningFieldConfig
 from avatar.checks import DataError
 from avatar.data.canonical_frames import CanonicalOutfit
 from avatar.data.outfits import Outfit
+from avatar.invocation import command_line
 from avatar.io.documents import read_yaml
 from avatar.nn.posing import LearnedSkinning
 from avatar.records import Template
 from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.values import option
 
 CANONICALIZERS = "canonical"  # the folder of their runs, beside those of the methods
 SAME_BODY = 1e-3  # metres between the vertices of a canonicalizer's body and an outfit's, at most
@@ -28,8 +30,9 @@ def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
         DataError: with the command that makes it, when it is not there or was made for another body.
     """
     folder = runs_root / CANONICALIZERS / outfit.dataset / outfit.name / name
-    command = f"python tools/canonicalize.py dataset={outfit.dataset} outfit={outfit.name} name={name}"
-    command += "" if runs_root == Path("runs") else f" runs_root={runs_root}"
+    where = [f"dataset={outfit.dataset}", f"outfit={outfit.name}", f"name={name}"]
+    where += [] if runs_root == Path("runs") else [option("runs_root", runs_root)]
+    command = command_line("canonicalize", *where)
     settings, anew = folder / "config.yaml", f"Delete {folder}, then run: {command}"
     if not settings.is_file():
         raise DataError(folder, f"expected the canonicalizer of {outfit.name}, there is none.", f"Make it: {command}")

@@ -107,7 +107,7 @@ def test_a_process_alone_is_a_team_of_one(monkeypatch):
 
 
 def test_what_trains_in_one_process_refuses_several(monkeypatch):
-    monkeypatch.setattr("avatar.training.distributed.current_team", lambda: Team(1, 2))
+    monkeypatch.setattr("avatar.training.teams.current_team", lambda: Team(1, 2))
     with pytest.raises(AvatarError, match=r"scanimate: expected one process, got 2.*without torchrun"):
         train_implicit(RunConfig())
     with pytest.raises(AvatarError, match=r"canonicalizer: expected one process, got 2.*without torchrun"):
