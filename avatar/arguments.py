@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import hydra
@@ -19,16 +21,20 @@ from omegaconf import OmegaConf
 from avatar.checks import AvatarError, DataError, did_you_mean, sentences, unknown_name
 from avatar.invocation import install_line
 from avatar.io.documents import check_events, read_yaml
+from avatar.values import QUOTED, TextOption, tidy_option
 
 PLUGINS = ("joblib", "submitit_slurm", "submitit_local")  # launchers of the extra `cluster`
 
 
-def tidy_arguments(arguments: list[str], sweeps: bool = False) -> list[str]:
-    """Arguments as Hydra takes them: its flags first, and lists that a shell split at a blank joined again.
+def tidy_arguments(
+    arguments: list[str], sweeps: bool = False, texts: Mapping[str, TextOption] = MappingProxyType({})
+) -> list[str]:
+    """Arguments as Hydra takes them: flags first, lists that a shell split at a blank joined again, texts in quotes.
 
     Args:
         arguments: those of the command line.
         sweeps: whether the verb is a multirun without being asked for one.
+        texts: the verb's options that hold text.
 
     Raises:
         AvatarError: for flags there are not and words that are no option, with the form to write instead.
@@ -48,8 +54,8 @@ def tidy_arguments(arguments: list[str], sweeps: bool = False) -> list[str]:
     flags = list(arguments)
     for word in known.overrides:
         flags.remove(word)
-    options = list(_joined(known.overrides))
     several = known.multirun or sweeps
+    options = [tidy_option(word, texts, several) for word in _joined(known.overrides, texts)]
     for option in options:
         _check_option(option, several)
     return [*flags, *options]
@@ -60,13 +66,21 @@ def _refuse_arguments(message: str) -> None:
     raise AvatarError(message[:1].lower() + message[1:] + ".")
 
 
-def _joined(words: list[str]) -> Iterator[str]:
-    """Options, each with the words after it up to the bracket that closes its list."""
+def _joined(words: list[str], texts: Mapping[str, TextOption]) -> Iterator[str]:
+    """Options, each with the words after it up to the bracket that closes its list.
+
+    A path may have brackets of its own: its list ends with a bracket before the next option at the latest.
+    """
     waiting: list[str] = []
-    for word in words:
+    for word, following in zip(words, [*words[1:], "="]):
         waiting.append(word)
         text = " ".join(waiting)
-        if text.count("[") <= text.count("]") and text.count("{") <= text.count("}"):
+        name, _, value = text.partition("=")
+        known = texts.get(name.lstrip("+"), TextOption(path=False))
+        bare = QUOTED.sub("", value)
+        closed = bare.count("[") <= bare.count("]") and bare.count("{") <= bare.count("}")
+        ended = not known.several or value[:1] != "[" or (value[-1] == "]" and "=" in following)
+        if closed or (known.path and ended):
             yield text
             waiting = []
     if waiting:
@@ -81,11 +95,12 @@ def _check_option(option: str, several: bool) -> None:
         name, equal, value = option.partition("=")
         if not equal:
             raise AvatarError(f"{option}: expected an option, written NAME=VALUE.") from error
-        form = f"'{name}=\"{value}\"'"
+        form = shlex.quote(f'{name}="{value}"')
         raise AvatarError(f"{option}: expected NAME=VALUE. Write a value with special letters as {form}.") from error
     if override.value_type is ValueType.SIMPLE_CHOICE_SWEEP and not several and option.count("hydra.") == 0:
         name, _, value = option.partition("=")
-        raise AvatarError(f"{option}: for a list write '{name}=[{value}]'; for one job each put -m before the options.")
+        listed = shlex.quote(f"{name}=[{value}]")
+        raise AvatarError(f"{option}: for a list write {listed}; for one job each put -m before the options.")
 
 
 def explain(error: Exception, verb: str, arguments: list[str], conf: Path) -> str:

@@ -75,6 +75,19 @@ def check_name(what: str, name: str) -> str:
     return name
 
 
+def check_trained(path: Path) -> tuple[Path, Path]:
+    """The files of a run's weights and of their description, of which ``path`` lacks the endings.
+
+    Raises:
+        DataError: for one that is not there.
+    """
+    files = path.with_suffix(".safetensors"), path.with_suffix(".json")
+    for file in files:
+        if not file.is_file():
+            raise DataError(file, "no such file.", "Train the run first (tools/train.py).")
+    return files
+
+
 def plain_name(text: str, otherwise: str) -> str:
     """The nearest plain name to what a file calls itself; ``otherwise`` where nothing of it is left."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).lstrip("_.-")[:64] or otherwise

@@ -12,6 +12,7 @@ import os
 import select
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -51,13 +52,8 @@ def run(name: str, verb: Verb | None = None) -> NoReturn:
         name: the verb's name.
         verb: the verb, where it is not in `VERBS`.
     """
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        os.write(2, f"{name}: stopped by {signal.Signals(number).name} before it began.\n".encode())
-        os._exit(STOPPED)
-
     for number in (signal.SIGINT, signal.SIGTERM):  # until the verb listens itself
-        signal.signal(number, leave)
+        signal.signal(number, leave_at_once(name))
     try:
         try:
             start(name, verb or VERBS[name])
@@ -71,6 +67,16 @@ def run(name: str, verb: Verb | None = None) -> NoReturn:
         code = PIPE_CLOSED
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done
     sys.exit(code)
+
+
+def leave_at_once(verb: str) -> Callable[[int, FrameType | None], NoReturn]:
+    """What listens to signals while a verb is imported, amid which no exception may be raised."""
+
+    def leave(number: int, frame: FrameType | None) -> NoReturn:
+        os.write(2, f"{verb}: stopped by {signal.Signals(number).name} before it began.\n".encode())
+        os._exit(STOPPED)
+
+    return leave
 
 
 def start(name: str, verb: Verb) -> None:

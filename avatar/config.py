@@ -2,7 +2,7 @@
 
 Defaults live in the dataclasses alone. Here they become plain nodes that `conf/` builds on, so a misspelt option on
 the command line is refused by Hydra, and one in a file by `settings_from_dict`. Names pick classes from registries;
-a config never names code.
+a config never names code. What a verb does, and torch, is imported once its options are known to be right.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from avatar.arguments import explain, refuse_code, tidy_arguments
-from avatar.checks import AvatarError
-from avatar.cli import refuse, silence_closed_streams
+from avatar.checks import AvatarError, check_trained
+from avatar.cli import leave_at_once, refuse, silence_closed_streams
+from avatar.declared import declared, method_settings
 from avatar.environment import prepared_process
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
 from avatar.io.documents import read_yaml
@@ -38,12 +39,12 @@ from avatar.pipeline.endings import report_ending
 from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
 from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.training.signals import Stopped, leave_when_asked
+from avatar.training.signals import Stopped, leave_when_asked, listening
+from avatar.values import text_options
 from avatar.verbs import VERBS, Verb, resolve
 from avatar.world import current_world, torchrun_world
 
 CONF = (checkout() or PACKAGE) / "conf"  # a wheel has it in the package
-METHODS = "avatar.methods.registry:METHODS"
 Settings = TypeVar("Settings")
 report = logging.getLogger(__name__)
 
@@ -53,16 +54,21 @@ def settings_class(verb: Verb) -> type:
     return resolve(verb.settings)
 
 
+def declared_class(name: str) -> type:
+    """The class that ``module:Class`` names; one of this package as its source declares it, without torch."""
+    return declared(name) if name.startswith("avatar.") else resolve(name)
+
+
 def register(name: str, verb: Verb | None = None) -> None:
     """Stores the defaults of a verb's settings, and of all methods' where it takes one, under ``<name>_defaults``.
 
     The configuration file of a verb that is not in `VERBS` is stored beside them, for Hydra searches ``conf/`` alone.
     """
     verb = verb or VERBS[name]
-    store, defaults = ConfigStore.instance(), settings_to_dict(settings_class(verb)())
+    store, defaults = ConfigStore.instance(), settings_to_dict(declared_class(verb.settings)())
     store.store(name=f"{name}_defaults", node=defaults)
-    for method, kind in resolve(METHODS).items() if isinstance(defaults.get("method"), dict) else ():
-        options = settings_to_dict(kind.Settings())
+    for method, kind in method_settings().items() if isinstance(defaults.get("method"), dict) else ():
+        options = settings_to_dict(declared_class(kind)())
         store.store(group="method", name=f"{method}_defaults", node={"settings": options})
         if not (CONF / "method" / f"{method}.yaml").is_file():  # a method that fixes nothing needs no file there
             node = {"name": method, "variant": method, "settings": options}
@@ -104,7 +110,7 @@ def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | Non
     journal = Path("runs/multirun").absolute() / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{os.getpid()}"
     os.environ["AVATAR_MULTIRUN"] = str(journal)  # conf/hydra/quiet.yaml: the launchers' own files go there as well
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on, instead of printing them its way
-    parent, run = os.getpid(), run or resolve(verb.run)
+    parent = os.getpid()
 
     @hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)
     def main(config: DictConfig) -> None:
@@ -115,7 +121,8 @@ def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | Non
         listen_to_verbs(logging.INFO if world.is_main else logging.WARNING)
         try:
             register(name, verb)
-            sys.argv[1:] = tidy_arguments(sys.argv[1:], sweeps=bool(verb.then))
+            texts = text_options(declared_class(verb.settings))
+            sys.argv[1:] = tidy_arguments(sys.argv[1:], bool(verb.then), texts)
             refuse_code(sys.argv[1:])
             main()
         except SystemExit as leaving:
@@ -147,8 +154,9 @@ def conclude(name: str, verb: Verb, outcomes: list[Outcome]) -> int:
     return code
 
 
-@prepared_process()
-def run_job(name: str, verb: Verb, run: Callable[[Any], Any], config: DictConfig, journal: Path, parent: int) -> None:
+def run_job(
+    name: str, verb: Verb, run: Callable[[Any], Any] | None, config: DictConfig, journal: Path, parent: int
+) -> None:
     """One job of a verb, in the ``parent`` process or in one that a launcher started.
 
     In a multirun its outcome is noted in ``journal``, and a failure is no reason to leave. The verb's ``then``
@@ -173,8 +181,11 @@ def run_job(name: str, verb: Verb, run: Callable[[Any], Any], config: DictConfig
     if several:
         note_outcome(journal, job.job.num, line, State.running)
     try:
-        settings = to_settings(settings_class(verb), config)
-        with leave_when_asked():
+        check_early(to_settings(declared_class(verb.settings), config))
+        leaving = (signal.SIGINT, signal.SIGTERM) if os.getpid() == parent else ()
+        with listening(leave_at_once(name), leaving):
+            settings, run = to_settings(settings_class(verb), config), run or resolve(verb.run)
+        with leave_when_asked(), prepared_process():
             WORK.clear()
             started = time.monotonic()
             result = run(settings)
@@ -201,6 +212,16 @@ def run_job(name: str, verb: Verb, run: Callable[[Any], Any], config: DictConfig
     if several:
         note_outcome(journal, job.job.num, line, State.finished, settings=settings_to_dict(settings))
     return None
+
+
+def check_early(settings: Any) -> None:
+    """Refuses a run that is not there before its verb is imported.
+
+    Raises:
+        DataError: naming the file that is missing.
+    """
+    if isinstance(run := getattr(settings, "run", None), Path):
+        check_trained(run / "avatar")
 
 
 class Lines(logging.StreamHandler):

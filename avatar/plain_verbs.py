@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import json
 import sys
 from collections.abc import Callable
 from dataclasses import fields
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from avatar.cli import refuse
 from avatar.invocation import command_line
+from avatar.values import expand, option
 
 if TYPE_CHECKING:
     from avatar.pipeline.parameters import ParametersConfig
@@ -21,6 +23,11 @@ def parser_of(verb: Callable[[], None]) -> argparse.ArgumentParser:
     """A parser of a verb's arguments that describes it by its docstring."""
     text = inspect.cleandoc(verb.__doc__ or "")
     return argparse.ArgumentParser(verb.__name__, description=text, formatter_class=argparse.RawTextHelpFormatter)
+
+
+def path(text: str) -> Path:
+    """A path as an argument names it, its ``~`` included."""
+    return Path(expand(text))
 
 
 def doctor() -> None:
@@ -46,9 +53,9 @@ def convert_body() -> None:
     convert_body data/theirs/coat/template.npz with_uv.npz --uv body.obj
     """
     parser = parser_of(convert_body)
-    parser.add_argument("source", type=Path, help="the downloaded model, .npz or .pkl")
-    parser.add_argument("target", type=Path, help="the .npz to write")
-    parser.add_argument("--uv", type=Path, help="an OBJ of the same mesh whose texture coordinates POP is to use")
+    parser.add_argument("source", type=path, help="the downloaded model, .npz or .pkl")
+    parser.add_argument("target", type=path, help="the .npz to write")
+    parser.add_argument("--uv", type=path, help="an OBJ of the same mesh whose texture coordinates POP is to use")
     paths = parser.parse_args()
 
     from avatar.body.convert import convert_body_model
@@ -59,7 +66,8 @@ def convert_body() -> None:
     except AvatarError as error:
         sys.exit(refuse("convert_body", error))
     print(f"{paths.target}: {kind} body, {paths.target.stat().st_size / 1e6:.1f} MB")
-    print(f"Name it in the outfit.yaml of packed data (docs/data.md), as body: {{path: {paths.target.resolve()}}}")
+    name = json.dumps(str(paths.target.resolve()), ensure_ascii=False)
+    print(f"Name it in the outfit.yaml of packed data (docs/data.md), as body: {{path: {name}}}")
 
 
 def make_body() -> None:
@@ -72,7 +80,7 @@ def make_body() -> None:
     from avatar.checks import AvatarError
 
     parser = parser_of(make_body)
-    parser.add_argument("target", type=Path, help="the .npz to write")
+    parser.add_argument("target", type=path, help="the .npz to write")
     for parameter in fields(Phenotype):
         parser.add_argument(f"--{parameter.name}", type=float, default=parameter.default)
     options = vars(parser.parse_args())
@@ -98,7 +106,7 @@ def make_motion() -> None:
 
     parser = parser_of(make_motion)
     parser.add_argument("name", help="walk, squat, twist, reach, kick, bend or dance")
-    parser.add_argument("target", type=Path, help="the .npz to write")
+    parser.add_argument("target", type=path, help="the .npz to write")
     parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--fps", type=float, default=30.0)
     options = parser.parse_args()
@@ -120,8 +128,8 @@ def pack() -> None:
     from avatar.data.packed_layout import write_packed_outfit
 
     parser = parser_of(pack)
-    parser.add_argument("source", type=Path, help="the outfit's folder")
-    parser.add_argument("target", type=Path, help="the folder to write")
+    parser.add_argument("source", type=path, help="the outfit's folder")
+    parser.add_argument("target", type=path, help="the folder to write")
     paths = parser.parse_args()
     try:
         packed = write_packed_outfit(open_outfit_folder(paths.source), paths.target)
@@ -130,7 +138,7 @@ def pack() -> None:
     count = sum(len(packed.frames(split)) for split in ("train", "test") if packed.has_frames(split))
     where = {"dataset": paths.target.parent.name, "outfit": paths.target.name, "data_root": paths.target.parent.parent}
     print(f"{paths.target}: {count} frames")
-    print(f"next: {command_line('train', *(f'{option}={value}' for option, value in where.items()))}")
+    print(f"next: {command_line('train', *(option(name, value) for name, value in where.items()))}")
 
 
 def parameters(config: ParametersConfig) -> list[Path]:

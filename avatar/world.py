@@ -3,22 +3,22 @@
 Gradients are averaged, the statistics of every normalisation are those of the whole batch (`nn.shared_norm`), and what
 is computed once an outfit is computed for all outfits of the step in every process; so a run gives the losses and
 gradients of one process with the same batch, to rounding (with noise on the input: in distribution). NCCL serves CUDA,
-gloo the CPU.
+gloo the CPU. torch is imported where it is needed, for every command asks for its world, and help needs no torch.
 """
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
-
-import torch
-import torch.distributed as dist
-from torch import Tensor, nn
+from typing import TYPE_CHECKING, Any
 
 from avatar.checks import AvatarError
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ class World:
 
 def current_world() -> World:
     """The process group this process has joined; a single process without one."""
-    if dist.is_available() and dist.is_initialized():
+    dist = sys.modules.get("torch.distributed")  # whoever has joined a group has imported it
+    if dist is not None and dist.is_available() and dist.is_initialized():
         return World(dist.get_rank(), dist.get_world_size())
     return World()
 
@@ -58,6 +59,9 @@ def torchrun_world() -> Iterator[World]:
     if int(os.environ.get("WORLD_SIZE", "1")) < 2 or "LOCAL_RANK" not in os.environ:
         yield World()
         return
+    import torch
+    import torch.distributed as dist
+
     local, cuda = int(os.environ["LOCAL_RANK"]), torch.cuda.is_available()
     if cuda:
         if local >= torch.cuda.device_count():
@@ -84,6 +88,9 @@ def average(tensors: list[Tensor], world: World) -> None:
     """Replaces tensors by their mean over all ranks, in one exchange; every process gets the same bits."""
     if world.size == 1:
         return
+    import torch
+    import torch.distributed as dist
+
     flat = torch.cat([tensor.flatten() for tensor in tensors])
     dist.all_reduce(flat)
     flat /= world.size
@@ -93,6 +100,8 @@ def average(tensors: list[Tensor], world: World) -> None:
 
 def step_outfits(outfit_ids: Tensor, outfits: int, world: World) -> Tensor:
     """The outfits in any process's shard of a step, ascending: own frames' ``(B,)`` to the world's ``(O,)``."""
+    import torch
+
     seen = torch.zeros(outfits)
     seen[outfit_ids.cpu()] = 1
     average([seen], world)
@@ -104,6 +113,8 @@ def gradients_of(model: nn.Module, world: World) -> list[Tensor]:
 
     Parameters without a gradient in every process (of a loss term that is off) keep none: Adam would count a step.
     """
+    import torch
+
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     present = torch.tensor([float(parameter.grad is not None) for parameter in parameters])
     average([present], world)
@@ -117,6 +128,8 @@ def gather(value: Any, world: World) -> list[Any]:
     """A plain value of every process, in the order of ranks; all processes get all."""
     if world.size == 1:
         return [value]
+    import torch.distributed as dist
+
     values: list[Any] = [None] * world.size
     dist.all_gather_object(values, value)
     return values
@@ -126,6 +139,8 @@ def broadcast(value: Any, world: World) -> Any:
     """The value of rank 0, in every process."""
     if world.size == 1:
         return value
+    import torch.distributed as dist
+
     values = [value]
     dist.broadcast_object_list(values, src=0)
     return values[0]

@@ -12,7 +12,8 @@ import sys
 import time
 from pathlib import Path
 
-import avatar.config  # noqa: F401
+import avatar.config
+import avatar.pipeline.demo  # noqa: F401
 
 
 def run(words: list[str], folder: str, output: str) -> None:

@@ -19,7 +19,9 @@ OUTSIDE = {path.stem for path in TOOLS.iterdir() if path.suffix == ".py" or (pat
 LAYERS = {
     "records": 0,
     "checks": 0,
+    "declared": 0,
     "settings": 0,
+    "values": 0,
     "environment": 0,
     "invocation": 0,
     "progress": 0,
@@ -65,6 +67,7 @@ LAZY = {*ONLY_IN, "roma", "pyvista", "pygltflib", "pxr", "matplotlib", "skimage"
 KERNELS = {"avatar.simulate.kernels": "warp"}  # decorators need it at the top; itself imported inside functions only
 IMPORTERS = ("require", "import_module", "__import__")
 RESTRICTED = PACKAGE / "body" / "inert_pickle.py"
+DECLARED = PACKAGE / "declared.py"  # executes statements of the package's own sources, as importing them would
 # What builds a tree by default, which on some points never ends where denormals count as zero (geometry/trees.py)
 TREES = {
     *("KDTree", "cKDTree", "kdtree", "BallTree", "NearestNeighbors", "KNeighborsClassifier", "KNeighborsRegressor"),
@@ -240,7 +243,7 @@ def test_no_circle_of_modules():
 
 @pytest.mark.parametrize("path", sources("avatar", "tools"), ids=lambda path: str(path.relative_to(ROOT)))
 def test_nothing_read_is_ever_run(path):
-    if path != RESTRICTED:
+    if path not in (RESTRICTED, DECLARED):
         assert careless_calls(parse(path)) == []
 
 

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 import avatar.invocation
 from avatar.arguments import explain, tidy_arguments
@@ -270,10 +271,11 @@ def test_a_reader_of_progress_that_leaves_stops_training_with_all_saved(folder):
 
 @pytest.mark.slow
 def test_a_verb_says_what_it_made_and_the_next_command_works_as_printed(folder):
-    train = [*SHORT, "train.steps=4", "train.log_every=2", "name=next"]
+    odd = "it's (1), ä $x/runs"
+    train = [*SHORT, "train.steps=4", "train.log_every=2", "name=next", f"runs_root={odd}"]
     code, _, err = finish(begin(folder, "train", *train))
     assert code == 0 and "train: step 2 of 4, loss " in err and "train: step 4 of 4, loss " in err
-    assert "train: done in " in err and "(4 steps).\n  runs/static/open/tiny/next/avatar.safetensors\n" in err
+    assert "train: done in " in err and f"(4 steps).\n  {odd}/static/open/tiny/next/avatar.safetensors\n" in err
     code, _, again = finish(begin(folder, "train", *train))
     assert code == 0 and "train: finished already, nothing was left to do." in again
     (following,) = re.findall(r"^next: (.*)$", err, re.M)
@@ -283,7 +285,51 @@ def test_a_verb_says_what_it_made_and_the_next_command_works_as_printed(folder):
     )
     assert "predict: done in " in done.stderr and "(3 made)" in done.stderr
     (following,) = re.findall(r"^next: (.*)$", done.stderr, re.M)
-    assert following.endswith("/tools/evaluate.py 'runs=[runs/static/open/tiny/next]'")
+    assert shlex.split(following)[-1] == f'runs=["{odd}/static/open/tiny/next"]'
+    done = subprocess.run(following, shell=True, cwd=folder, capture_output=True, text=True, check=True)
+    assert f"  {odd}/static/open/tiny/next/scores.csv\n" in done.stderr
+
+
+ODD = ["walk(2).npz", "1 a#b,c.npz", 'it\'s "ä" [x] {y} $z ${w}.npz', "a\u0308=%d.npz", "true", "~no one"]
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_a_shell_hands_over_any_path(name, tmp_path):
+    line = shlex.join([sys.executable, str(ROOT / "tools/report.py"), f"run={name}"])
+    done = subprocess.run(["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 2 and f": {name}/avatar.safetensors: no such file." in done.stderr
+
+
+def test_the_home_folder_is_known_after_an_equals_sign(tmp_path):
+    for line in (f"{ROOT}/tools/report.py run=~/1", f"{ROOT}/tools/pack.py ~/1 ~/2"):
+        done = subprocess.run(
+            ["bash", "-c", f"{sys.executable} {line}"],
+            cwd=tmp_path,
+            env=os.environ | {"HOME": "/no home"},
+            capture_output=True,
+            text=True,
+            timeout=100,
+        )
+        assert done.returncode == 2 and "/no home/1" in done.stderr
+
+
+def test_a_multirun_takes_an_existing_path_with_a_comma_for_one_value(tmp_path):
+    (tmp_path / "a,b").mkdir()
+    code, _, err = finish(begin(tmp_path, "report", "-m", "run=a,b,c d"))
+    assert code == 2 and "2 failed" in err
+    assert ": a,b/avatar.safetensors: no such file." in err and ": c d/avatar.safetensors: no such file." in err
+
+
+@pytest.mark.slow
+def test_plain_verbs_take_any_path_and_print_what_follows(folder):
+    odd = Path("it's (1), ä $x")
+    code, out, _ = finish(begin(folder, "pack", "data/open/tiny", str(odd / "packed" / "tiny")))
+    (following,) = re.findall(r"^next: (.*)$", out, re.M)
+    assert code == 0
+    done = subprocess.run(f"{following} --cfg job", shell=True, cwd=folder, capture_output=True, text=True, check=True)
+    assert yaml.safe_load(done.stdout)["data_root"] == str(odd)
+    code, out, _ = finish(begin(folder, "make_motion", "walk", f"{odd}/1.npz", "--seconds=0.1"))
+    assert code == 0 and (folder / odd / "1.npz").is_file()
 
 
 def test_time_left_counts_what_ends_the_run_first(monkeypatch, caplog):

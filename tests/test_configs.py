@@ -61,8 +61,8 @@ def paths_of(settings: Any, prefix: str = "") -> Iterator[tuple[str, Path]]:
         value, name = getattr(settings, field.name), f"{prefix}{field.name}"
         if is_dataclass(value):
             yield from paths_of(value, f"{name}.")
-        elif isinstance(value, Path) or field.name == "root":
-            yield name, Path(value)
+        elif isinstance(value, Path):
+            yield name, value
         elif isinstance(value, tuple):
             yield from ((name, item) for item in value if isinstance(item, Path))
 

@@ -64,9 +64,9 @@ def in_fresh_python(code: str, *arguments: str, **variables: str) -> subprocess.
 
 def test_every_verb_has_its_idle_threads_sleep_soon_unless_told_otherwise():
     """OpenMP itself says what it has read; it does so when torch loads it."""
-    said = in_fresh_python("import avatar.config", OMP_DISPLAY_ENV="verbose").stderr
+    said = in_fresh_python("import avatar.config, torch", OMP_DISPLAY_ENV="verbose").stderr
     assert "OMP_WAIT_POLICY = 'PASSIVE'" in said and "GOMP_SPINCOUNT = '10000'" in said
-    said = in_fresh_python("import avatar.config", OMP_DISPLAY_ENV="verbose", OMP_WAIT_POLICY="ACTIVE").stderr
+    said = in_fresh_python("import avatar.config, torch", OMP_DISPLAY_ENV="verbose", OMP_WAIT_POLICY="ACTIVE").stderr
     assert "OMP_WAIT_POLICY = 'ACTIVE'" in said and "GOMP_SPINCOUNT = '10000'" not in said
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -120,11 +121,11 @@ def merge_weights(weights: np.ndarray, parents: Sequence[int], count: int) -> np
     return merged[:, :count]
 
 
-def way_to_file(kind: str, path: str = "<file.npz>") -> str:
+def way_to_file(kind: str, path: Path | None = None) -> str:
     """Where a model is to be had, and the command that makes our file of it."""
     return (
         f"Download the {kind} model from {DOWNLOAD_PAGES[kind]} (its licence applies), then run: "
-        f"python tools/convert_body.py <downloaded file> {path}"
+        f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path)) if path else '<file.npz>'}"
     )
 
 
@@ -137,13 +138,14 @@ def converted_kind(path: Path) -> str:
     try:
         return str(read_arrays(path, {"kind": "text 1"})["kind"][0])
     except DataError as error:
-        mend = f"Convert your own SMPL, SMPL-H or SMPL-X file: python tools/convert_body.py <downloaded file> {path}"
+        line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path))}"
+        mend = f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"
         raise DataError(path, str(error).removeprefix(f"{path}: "), mend) from error
 
 
 def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
     """The arrays of a converted model, or an error that says how to come by one."""
-    mend = way_to_file(kind or "smplx", str(path))
+    mend = way_to_file(kind or "smplx", path)
     if not Path(path).is_file():
         raise DataError(path, f"expected a converted {kind or 'SMPL-family'} body model, there is no such file.", mend)
     try:

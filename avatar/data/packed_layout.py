@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -292,7 +293,8 @@ def _template_of_mesh(path: Path) -> Template:
     """A body that is only a mesh, with its UV atlas if it has one: everything hangs on one root joint at the origin."""
     if not path.is_file():
         problem = "expected template.npz or template.obj (the minimal body in its T-pose), there is neither."
-        mend = f"Make one: python tools/convert_body.py <downloaded SMPL file> {path.with_suffix('.npz')}"
+        target = shlex.quote(str(path.with_suffix(".npz")))
+        mend = f"Make one: python tools/convert_body.py <downloaded SMPL file> {target}"
         raise DataError(path.parent, problem, mend)
     mesh = read_mesh(path)
     faces = np.asarray(mesh.faces, np.int64)

@@ -22,7 +22,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from avatar.checks import AvatarError, DataError, check_finite
+from avatar.checks import AvatarError, DataError, check_finite, check_trained
 from avatar.io.documents import read_json
 from avatar.io.npz import write_whole
 
@@ -226,10 +226,7 @@ def read_weights(path: Path, facts: Iterable[str] = ()) -> tuple[dict[str, Tenso
         DataError: when a file is missing, a fact is missing, the weights do not match the hash in their description,
             or are not finite.
     """
-    weights, described = path.with_suffix(".safetensors"), path.with_suffix(".json")
-    for needed in (weights, described):
-        if not needed.is_file():
-            raise DataError(needed, "no such file.", "Train the run first (tools/train.py).")
+    weights, described = check_trained(path)
     description = read_json(described)
     missing = [fact for fact in ("sha256", *facts) if fact not in description]
     if missing:

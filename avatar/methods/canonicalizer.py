@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -32,6 +31,7 @@ from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
+from avatar.invocation import command_line
 from avatar.io.building import building
 from avatar.io.checkpoints import read_weights
 from avatar.io.documents import read_yaml
@@ -39,6 +39,7 @@ from avatar.methods.base import Inputs, Position, Stage, Task
 from avatar.methods.settings import CANONICALIZERS
 from avatar.records import Frame, LossTerms, Template
 from avatar.settings import settings_from_dict
+from avatar.values import option
 
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
 CHUNK = 20_000  # points queried at once, or fewer where memory runs out
@@ -67,7 +68,6 @@ class CycleConfig:
     save_every: int = 500  # steps
     log_every: int = 20  # steps
     seed: int = 0
-    validate_every: ClassVar[int] = 1 << 62  # no frames are held back
 
     def __post_init__(self):
         for name in ("first_steps", "batch", "code_steps", "save_every", "log_every"):
@@ -81,6 +81,11 @@ class CycleConfig:
             raise AvatarError(f"minutes: expected above 0 or null, got {self.minutes}.")
         if min(self.first_lr, self.second_lr, self.code_lr) <= 0 or not 0 < self.decay <= 1:
             raise AvatarError("first_lr, second_lr, code_lr: expected above 0, decay: in (0, 1].")
+
+    @property
+    def validate_every(self) -> int:
+        """Never: no frames are held back."""
+        return self.steps + 1
 
     @property
     def steps(self) -> int:
@@ -296,8 +301,9 @@ def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
         DataError: with the command that makes it, when it is not there or was made for another body.
     """
     folder = runs_root / CANONICALIZERS / outfit.dataset / outfit.name / name
-    command = f"python tools/canonicalize.py dataset={outfit.dataset} outfit={outfit.name} name={name}"
-    command += "" if runs_root == Path("runs") else f" runs_root={runs_root}"
+    where = [f"dataset={outfit.dataset}", f"outfit={outfit.name}", f"name={name}"]
+    where += [] if runs_root == Path("runs") else [option("runs_root", runs_root)]
+    command = command_line("canonicalize", *where)
     settings, anew = folder / "config.yaml", f"Delete {folder}, then run: {command}"
     if not settings.is_file():
         raise DataError(folder, f"expected the canonicalizer of {outfit.name}, there is none.", f"Make it: {command}")

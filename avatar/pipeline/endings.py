@@ -10,6 +10,7 @@ from typing import Any
 
 from avatar.invocation import activation_line, command_line, interpreter, shorten
 from avatar.progress import WORK, in_words
+from avatar.values import option
 
 RESUMED = ("simulate", "canonicalize", "train", "predict", "evaluate", "mesh", "experiment")  # skip what is finished
 SPLITS = ("train", "test", "validation")
@@ -19,14 +20,14 @@ Ending = tuple[list[Path], list[str]]  # what was made, and commands that may fo
 
 def data_root(folder: Path) -> list[str]:
     """The option that names a data root, where it is not the usual one."""
-    return [] if folder == Path("data") else [f"data_root={folder}"]
+    return [] if folder == Path("data") else [option("data_root", folder)]
 
 
 def after_simulate(config: Any, reports: list[Any]) -> Ending:
     """The outfits' folders; training on the first one follows."""
     from avatar.simulate.recording import dressed_outfits
 
-    root, names = Path(config.root), [name for name, _ in dressed_outfits(config)]
+    root, names = config.root, [name for name, _ in dressed_outfits(config)]
     where = [f"dataset={root.name}", f"outfit={names[0]}", *data_root(root.parent)]
     return ([], []) if config.history else ([root / name for name in names], [command_line("train", *where)])
 
@@ -40,16 +41,16 @@ def after_canonicalize(config: Any, folder: Path) -> Ending:
 
 def after_training(config: Any, folder: Path) -> Ending:
     """The weights; predictions follow."""
-    return [folder / "avatar.safetensors"], [command_line("predict", f"run={folder}")]
+    return [folder / "avatar.safetensors"], [command_line("predict", option("run", folder))]
 
 
 def after_predict(config: Any, folders: list[Path]) -> Ending:
     """The folders of point clouds; scores of a split follow, or meshes of a motion."""
     name = folders[0].parent.name
     if config.motion is not None:
-        return folders, [command_line("mesh", f"run={config.run}", f"predictions={name}")]
+        return folders, [command_line("mesh", option("run", config.run), f"predictions={name}")]
     split = [] if name == "test" else [f"split={name}"]
-    return folders, [command_line("evaluate", f"runs=[{config.run}]", *split)]
+    return folders, [command_line("evaluate", option("runs", [config.run]), *split)]
 
 
 def after_evaluate(config: Any, scores: Any) -> Ending:
@@ -59,14 +60,14 @@ def after_evaluate(config: Any, scores: Any) -> Ending:
     if config.predictions is not None:
         return [(config.out or config.predictions) / "scores.csv"], []
     made = [scores_file(run, config.split) for run in config.runs]
-    return made, [command_line("report", f"run={config.runs[-1]}")]
+    return made, [command_line("report", option("run", config.runs[-1]))]
 
 
 def after_mesh(config: Any, reports: dict[Path, Any]) -> Ending:
     """The folders of meshes; the run's page follows, or a motion's animation files."""
     if config.predictions in SPLITS:
-        return list(reports), [command_line("report", f"run={config.run}")]
-    return list(reports), [command_line("export", f"run={config.run}", f"predictions={config.predictions}")]
+        return list(reports), [command_line("report", option("run", config.run))]
+    return list(reports), [command_line("export", option("run", config.run), f"predictions={config.predictions}")]
 
 
 def after_demo(config: Any, summary: Path) -> Ending:

@@ -21,6 +21,7 @@ from avatar.simulate.outfits import DEFAULT_SHAPES, OUTFIT_NAMES, OutfitConfig, 
 from avatar.simulate.poses import NamedPose, draw_poses
 from avatar.simulate.production import dress, simulate_motions, simulate_outfit
 from avatar.simulate.sequences import SEQUENCES, authored_motion
+from avatar.values import FileName
 
 log = logging.getLogger(__name__)
 
@@ -51,13 +52,15 @@ class SimulateConfig:
     """What to simulate. Anything left at None or empty is as the preset has it."""
 
     preset: str = "quick"  # quick, sample, full, motion
-    root: str = "data/open"  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>
+    root: Path = Path(
+        "data/open"
+    )  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>
     outfits: list[str] = field(default_factory=list)
-    shapes: list[str] = field(default_factory=list)  # who wears them: female, male, files of tools/make_body.py
+    shapes: list[FileName] = field(default_factory=list)  # who wears them: female, male, files of tools/make_body.py
     train: int | None = None  # settled frames of random poses
     test: int | None = None  # settled frames of authored sequences
-    train_motions: list[str] = field(default_factory=list)  # names of authored sequences, AMASS npz or BVH files
-    test_motions: list[str] = field(default_factory=list)
+    train_motions: list[FileName] = field(default_factory=list)  # names of authored sequences, AMASS npz or BVH files
+    test_motions: list[FileName] = field(default_factory=list)
     settled: bool = False  # record motion files as settled poses, spread over them, not as continuous sequences
     fps: float = 30.0  # frames per second of continuous sequences
     seconds: float = 6.0  # longest part taken of a sequence
@@ -139,7 +142,7 @@ def simulate(config: SimulateConfig) -> list[FrameReport]:
         Reports of the frames made in this run; those refused by the gates say why and are logged as warnings.
     """
     workers = config.workers or len(os.sched_getaffinity(0))
-    preset, root = PRESETS[config.preset], Path(config.root)
+    preset, root = PRESETS[config.preset], config.root
     sources = {
         split: getattr(config, f"{split}_motions") or list(getattr(preset, f"{split}_motions"))
         for split in ("train", "test")

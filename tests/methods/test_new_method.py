@@ -151,7 +151,8 @@ def test_a_mesh_regression_is_trained_resumed_predicted_and_scored(run):
     assert np.isfinite(read_points(next(clouds.glob("*.ply"))).points).all()
 
 
-def test_the_command_line_composes_it_without_a_file_in_conf(run):
+def test_the_command_line_composes_it_without_a_file_in_conf(run, monkeypatch):
+    monkeypatch.setattr("avatar.config.method_settings", lambda: {"mesh_regression": f"{__name__}:RegressionConfig"})
     settings = compose_settings("train", "method=mesh_regression", "size=full", "method.settings.scale=0.2")
     assert (settings.method.name, settings.method.variant) == ("mesh_regression", "mesh_regression")
     assert settings.method.settings == {"scale": 0.2} and settings.train.points == 50_000

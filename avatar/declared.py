@@ -1,0 +1,131 @@
+"""Settings classes as their source declares them: fields, types, defaults and comments, without the rest of a module.
+
+Importing a settings class imports the network or the solver that it configures, and torch, which takes seconds. Help,
+composition and the reading of a command line need the fields alone: here the statements that define a class, and those
+that they name, are executed alone. Functions and methods are left out, and with the latter
+the checks of ranges.
+"""
+
+from __future__ import annotations
+import __future__
+
+import ast
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from functools import cache
+from inspect import get_annotations
+from pathlib import Path
+from typing import Any, get_args
+
+PACKAGE = Path(__file__).resolve().parent
+HOMES: dict[type, Source] = {}  # of all classes made here
+COMMENTS: dict[type, dict[str, str]] = {}  # behind their fields
+
+
+def declared(name: str) -> type:
+    """The dataclass that ``module:Class`` names, with those that it is made of; their modules are not imported."""
+    module, _, attribute = name.partition(":")
+    kind = source(module).find(attribute)
+    settle_types(kind)
+    return kind
+
+
+def comments(kind: type) -> dict[str, str]:
+    """What the comments behind the fields of a declared dataclass say; empty for a field without one."""
+    known = {name: text for base in reversed(kind.__mro__) for name, text in COMMENTS.get(base, {}).items()}
+    return {field.name: known.get(field.name, "") for field in fields(kind)}
+
+
+def settle_types(hint: Any) -> None:
+    """Gives the annotations of all dataclasses in a type their values, as `typing.get_type_hints` reads them."""
+    for part in get_args(hint):
+        settle_types(part)
+    for base in hint.__mro__ if is_dataclass(hint) else ():
+        for name, text in get_annotations(base).items():
+            if base in HOMES and isinstance(text, str):
+                base.__annotations__[name] = HOMES[base].evaluate(text)
+                settle_types(base.__annotations__[name])
+
+
+def method_settings() -> dict[str, str]:
+    """``module:Class`` of the settings of each method, by its name: the ``name`` and ``Settings`` of a class there."""
+    found = {}
+    for path in sorted((PACKAGE / "methods").glob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            parts = node.body if isinstance(node, ast.ClassDef) else []
+            given = {part.targets[0].id: part.value for part in parts if isinstance(part, ast.Assign)}
+            if given.keys() >= {"name", "Settings"}:
+                found[given["name"].value] = f"avatar.methods.{path.stem}:{given['Settings'].id}"
+    return found
+
+
+@cache
+def source(module: str) -> Source:
+    """The source of a module of this package."""
+    path = PACKAGE.joinpath(*module.split(".")[1:])
+    return Source(path / "__init__.py" if path.is_dir() else path.with_suffix(".py"))
+
+
+class Source:
+    """The top level of a module's source, whose names get their values one by one, when they are asked for."""
+
+    def __init__(self, path: Path):
+        text = path.read_text(encoding="utf-8")
+        self.path, self.lines = str(path), text.encode().splitlines()
+        self.statements = {name: node for node in ast.parse(text).body for name in defined_names(node)}
+        self.values: dict[str, Any] = {"__name__": __name__, "__file__": self.path}
+
+    def find(self, name: str) -> Any:
+        """The value of a name of the module; that of a function is None."""
+        if name not in self.values:
+            self.define(name, self.statements[name])
+        return self.values[name]
+
+    def evaluate(self, text: str) -> Any:
+        """The value of an annotation."""
+        tree = ast.parse(text, mode="eval")
+        self.follow(tree)
+        return eval(compile(tree, self.path, "eval"), self.values)
+
+    def define(self, name: str, node: ast.stmt) -> None:
+        """Executes the statement that defines a name, after those that it needs."""
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == PACKAGE.name:
+            original = next(alias.name for alias in node.names if name in (alias.name, alias.asname))
+            self.values[name] = source(node.module or "").find(original)
+        elif isinstance(node, ast.FunctionDef):
+            self.values[name] = None
+        else:
+            if isinstance(node, ast.ClassDef):
+                node.body = [part for part in node.body if not isinstance(part, ast.FunctionDef)] or [ast.Pass()]
+            self.follow(node)
+            tree = ast.fix_missing_locations(ast.Module([node], []))
+            exec(compile(tree, self.path, "exec", __future__.annotations.compiler_flag, True), self.values)
+        if isinstance(node, ast.ClassDef):
+            HOMES[self.values[name]] = self
+            COMMENTS[self.values[name]] = dict(self.field_comments(node))
+
+    def follow(self, node: ast.AST) -> None:
+        """Defines the names of this module that a piece of its source needs; annotations are no part of that."""
+        if isinstance(node, ast.Name) and node.id in self.statements and isinstance(node.ctx, ast.Load):
+            self.find(node.id)
+        for field, part in ast.iter_fields(node):
+            for child in part if isinstance(part, list) else [part]:
+                if isinstance(child, ast.AST) and field != "annotation":
+                    self.follow(child)
+
+    def field_comments(self, node: ast.ClassDef) -> Iterator[tuple[str, str]]:
+        """The fields of a class, each with the comment behind it."""
+        for part in node.body:
+            if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name):
+                rest = self.lines[(part.end_lineno or 0) - 1][part.end_col_offset :].decode()
+                yield part.target.id, rest.strip().lstrip("# ")
+
+
+def defined_names(node: ast.stmt) -> list[str]:
+    """The names that a statement gives a value to."""
+    if isinstance(node, (ast.Import, ast.ImportFrom)):
+        return [alias.asname or alias.name.partition(".")[0] for alias in node.names]
+    if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
+        return [node.name]
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    return [part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
