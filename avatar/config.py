@@ -33,6 +33,7 @@ from avatar.checks import AvatarError, check_trained
 from avatar.cli import leave_at_once, refuse, silence_closed_streams
 from avatar.declared import declared
 from avatar.environment import prepared_process
+from avatar.help import help_text
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
 from avatar.pipeline.endings import report_ending
 from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
@@ -104,7 +105,10 @@ def command(verb: str, run: Callable[[Any], Any] | None = None) -> None:
             texts = text_options(declared(VERBS[verb].settings))
             sys.argv[1:] = tidy_arguments(sys.argv[1:], bool(VERBS[verb].then), texts)
             refuse_code(sys.argv[1:])
-            main()
+            if {"--help", "-h"} & set(sys.argv):
+                print(help_text(verb, [word for word in sys.argv[1:] if word[0] != "-"], CONF))
+            else:
+                main()
         except SystemExit as leaving:
             code = leaving.code
         except (HydraException, OmegaConfBaseException) as error:

@@ -39,6 +39,7 @@ LAYERS = {
     "config": 6,
     "arguments": 6,
     "cli": 6,
+    "help": 6,
     "__main__": 6,
     "plain_verbs": 6,
 }
@@ -302,7 +303,7 @@ def test_import_of_the_package_imports_nothing_else():
 
 
 def test_no_module_but_those_of_the_command_line_imports_a_heavy_or_optional_package():
-    modules = [module_of(path) for path in sources("avatar") if room_of(path) not in ("config", "arguments")]
+    modules = [module_of(path) for path in sources("avatar") if room_of(path) not in ("config", "arguments", "help")]
     modules.sort(key=lambda module: module in KERNELS)  # last, for what it loads would hide what others do
     code = (
         "import importlib, sys\n"
