@@ -23,6 +23,7 @@ from avatar.invocation import install_line
 from avatar.io.documents import check_events, read_yaml
 from avatar.values import QUOTED, TextOption, tidy_option
 
+FOLLOWING = ("method_size", "encoder")  # groups whose files follow from the method and the size
 PLUGINS = ("joblib", "submitit_slurm", "submitit_local")  # launchers of the extra `cluster`
 
 
@@ -125,21 +126,27 @@ def explain(error: Exception, verb: str, arguments: list[str], conf: Path) -> st
         name = named[1].partition("@")[0]
         groups = [str(path.relative_to(conf)) for path in conf.glob("*/")]
         chosen = [word for word in arguments if word.partition("=")[0] in groups and not name.startswith(word)]
-        return unknown_option(name, known_options(verb, chosen, conf))
+        try:
+            options, choices = known_options(verb, chosen, conf)
+        except HydraException:
+            options, choices = known_options(verb, [], conf)
+        return unknown_option(name, dict.fromkeys(group for group in choices if "@" not in group) | options)
     return f"{error.full_key}: {text}" if getattr(error, "full_key", None) else text
 
 
-def known_options(verb: str, chosen: list[str], conf: Path) -> dict[str, Any]:
-    """A verb's options with the chosen files of groups, nested, and the names of groups among them."""
+def known_options(verb: str, overrides: list[str], conf: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """A verb's options as a command line sets them, nested, and the files it chooses by their groups.
+
+    Raises:
+        HydraException: for a command line that cannot be composed.
+    """
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-        try:
-            config = hydra.compose(verb, chosen, return_hydra_config=True)
-        except HydraException:
-            config = hydra.compose(verb, return_hydra_config=True)
-    groups = [name for name in config.hydra.runtime.choices if "/" not in name and "@" not in name and name != "hydra"]
-    plain = OmegaConf.to_container(config, resolve=False)
-    return dict.fromkeys(groups) | {name: value for name, value in plain.items() if name != "hydra"}
+        config = hydra.compose(verb, overrides, return_hydra_config=True)
+    chosen = {str(name): choice for name, choice in config.hydra.runtime.choices.items()}
+    choices = {name: choice for name, choice in chosen.items() if name.partition("/")[0] not in ("hydra", *FOLLOWING)}
+    plain: Any = OmegaConf.to_container(config, resolve=False)
+    return {name: value for name, value in plain.items() if name != "hydra"}, choices
 
 
 def unknown_option(name: str, options: dict[str, Any]) -> str:

@@ -33,6 +33,7 @@ from avatar.checks import AvatarError, check_trained
 from avatar.cli import leave_at_once, refuse, silence_closed_streams
 from avatar.declared import declared, method_settings
 from avatar.environment import prepared_process
+from avatar.help import help_text
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
 from avatar.io.documents import read_yaml
 from avatar.pipeline.endings import report_ending
@@ -54,21 +55,16 @@ def settings_class(verb: Verb) -> type:
     return resolve(verb.settings)
 
 
-def declared_class(name: str) -> type:
-    """The class that ``module:Class`` names; one of this package as its source declares it, without torch."""
-    return declared(name) if name.startswith("avatar.") else resolve(name)
-
-
 def register(name: str, verb: Verb | None = None) -> None:
     """Stores the defaults of a verb's settings, and of all methods' where it takes one, under ``<name>_defaults``.
 
     The configuration file of a verb that is not in `VERBS` is stored beside them, for Hydra searches ``conf/`` alone.
     """
     verb = verb or VERBS[name]
-    store, defaults = ConfigStore.instance(), settings_to_dict(declared_class(verb.settings)())
+    store, defaults = ConfigStore.instance(), settings_to_dict(declared(verb.settings)())
     store.store(name=f"{name}_defaults", node=defaults)
     for method, kind in method_settings().items() if isinstance(defaults.get("method"), dict) else ():
-        options = settings_to_dict(declared_class(kind)())
+        options = settings_to_dict(declared(kind)())
         store.store(group="method", name=f"{method}_defaults", node={"settings": options})
         if not (CONF / "method" / f"{method}.yaml").is_file():  # a method that fixes nothing needs no file there
             node = {"name": method, "variant": method, "settings": options}
@@ -121,10 +117,13 @@ def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | Non
         listen_to_verbs(logging.INFO if world.is_main else logging.WARNING)
         try:
             register(name, verb)
-            texts = text_options(declared_class(verb.settings))
+            texts = text_options(declared(verb.settings))
             sys.argv[1:] = tidy_arguments(sys.argv[1:], bool(verb.then), texts)
             refuse_code(sys.argv[1:])
-            main()
+            if {"--help", "-h"} & set(sys.argv):
+                print(help_text(name, verb, [word for word in sys.argv[1:] if word[0] != "-"], CONF))
+            else:
+                main()
         except SystemExit as leaving:
             code = leaving.code
         except (HydraException, OmegaConfBaseException) as error:
@@ -181,7 +180,7 @@ def run_job(
     if several:
         note_outcome(journal, job.job.num, line, State.running)
     try:
-        check_early(to_settings(declared_class(verb.settings), config))
+        check_early(to_settings(declared(verb.settings), config))
         leaving = (signal.SIGINT, signal.SIGTERM) if os.getpid() == parent else ()
         with listening(leave_at_once(name), leaving):
             settings, run = to_settings(settings_class(verb), config), run or resolve(verb.run)

@@ -17,14 +17,21 @@ from inspect import get_annotations
 from pathlib import Path
 from typing import Any, get_args
 
+from avatar.verbs import resolve
+
 PACKAGE = Path(__file__).resolve().parent
 HOMES: dict[type, Source] = {}  # of all classes made here
 COMMENTS: dict[type, dict[str, str]] = {}  # behind their fields
 
 
 def declared(name: str) -> type:
-    """The dataclass that ``module:Class`` names, with those that it is made of; their modules are not imported."""
+    """The dataclass that ``module:Class`` names, with those that it is made of; their modules are not imported.
+
+    Modules outside this package are.
+    """
     module, _, attribute = name.partition(":")
+    if module.partition(".")[0] != PACKAGE.name:
+        return resolve(name)
     kind = source(module).find(attribute)
     settle_types(kind)
     return kind

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from avatar.cli import refuse
+from avatar.declared import declared
 from avatar.invocation import command_line
 from avatar.values import expand, option
 
@@ -75,16 +76,17 @@ def make_body() -> None:
 
     make_body data/bodies/tall.npz --height 0.9 --weight 0.7
     """
+    parser = parser_of(make_body)
+    parser.add_argument("target", type=path, help="the .npz to write")
+    for parameter in fields(declared("avatar.body.anny:Phenotype")):
+        parser.add_argument(f"--{parameter.name}", type=float, default=parameter.default)
+    options = vars(parser.parse_args())
+    target = options.pop("target")
+
     from avatar.body.anny import Phenotype, anny_body
     from avatar.body.packed import write_body
     from avatar.checks import AvatarError
 
-    parser = parser_of(make_body)
-    parser.add_argument("target", type=path, help="the .npz to write")
-    for parameter in fields(Phenotype):
-        parser.add_argument(f"--{parameter.name}", type=float, default=parameter.default)
-    options = vars(parser.parse_args())
-    target = options.pop("target")
     try:
         body = anny_body(Phenotype(**options))
         write_body(target, body)
@@ -100,16 +102,17 @@ def make_motion() -> None:
     make_motion walk walk.npz
     make_motion dance data/motions/dance.npz --seconds 10 --fps 60
     """
-    from avatar.checks import AvatarError
-    from avatar.io.motions import write_motion
-    from avatar.simulate.sequences import authored_motion
-
     parser = parser_of(make_motion)
     parser.add_argument("name", help="walk, squat, twist, reach, kick, bend or dance")
     parser.add_argument("target", type=path, help="the .npz to write")
     parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--fps", type=float, default=30.0)
     options = parser.parse_args()
+
+    from avatar.checks import AvatarError
+    from avatar.io.motions import write_motion
+    from avatar.simulate.sequences import authored_motion
+
     try:
         motion = authored_motion(options.name, options.fps, options.seconds)
         write_motion(options.target, motion)
@@ -123,14 +126,15 @@ def pack() -> None:
 
     pack data/open/tee data/packed/tee
     """
-    from avatar.checks import AvatarError
-    from avatar.data.layouts import open_outfit_folder
-    from avatar.data.packed_layout import write_packed_outfit
-
     parser = parser_of(pack)
     parser.add_argument("source", type=path, help="the outfit's folder")
     parser.add_argument("target", type=path, help="the folder to write")
     paths = parser.parse_args()
+
+    from avatar.checks import AvatarError
+    from avatar.data.layouts import open_outfit_folder
+    from avatar.data.packed_layout import write_packed_outfit
+
     try:
         packed = write_packed_outfit(open_outfit_folder(paths.source), paths.target)
     except AvatarError as error:

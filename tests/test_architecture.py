@@ -46,6 +46,7 @@ LAYERS = {
     "api": 8,
     "arguments": 8,
     "cli": 8,
+    "help": 8,
     "__main__": 8,
     "plain_verbs": 8,
 }
@@ -356,7 +357,8 @@ def test_import_of_the_package_imports_nothing_else():
 
 
 def test_no_module_but_those_of_the_command_line_imports_a_heavy_or_optional_package():
-    modules = [module_of(path) for path in sources("avatar") if package_of(path) not in ("config", "arguments")]
+    command_line = ("config", "arguments", "help")
+    modules = [module_of(path) for path in sources("avatar") if package_of(path) not in command_line]
     modules.sort(key=lambda module: module in KERNELS)  # last, for what it loads would hide what others do
     code = (
         "import importlib, sys\n"

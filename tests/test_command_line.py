@@ -108,7 +108,8 @@ def test_every_package_of_an_install_line_is_in_the_extra_it_names():
 @pytest.mark.parametrize("tool", [path for path in TOOLS if path.stem != "doctor"], ids=lambda path: path.stem)
 def test_a_python_without_packages_names_the_line_to_run(tool, tmp_path):
     """``-S`` leaves out all that is installed, as the system's own Python has it."""
-    line = [sys.executable, "-S", tool, *(["a", "b"] if tool.stem == "convert_body" else [])]
+    needed = {"convert_body": ["a", "b"], "pack": ["a", "b"], "make_motion": ["walk", "b"], "make_body": ["a"]}
+    line = [sys.executable, "-S", tool, *needed.get(tool.stem, [])]
     done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
     assert "is not installed" in done.stderr and ".venv/bin/activate" in done.stderr

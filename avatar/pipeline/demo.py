@@ -35,7 +35,7 @@ class DemoConfig(RunConfig):
 
     canonicalizer: CanonicalizeConfig = field(default_factory=CanonicalizeConfig)  # its data and name are the run's
     static_share: float = 0.4  # of the training minutes, spent on the static floor
-    points: int = 50000
+    points: int = 50000  # predicted a frame
     meshes: int = 4  # frames meshed
     score: ScoreConfig = field(default_factory=ScoreConfig)
 

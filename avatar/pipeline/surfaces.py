@@ -25,7 +25,7 @@ class MeshConfig:
 
     run: Path = Path("runs/closet/sample/dress/default")
     predictions: str = "test"  # the split or motion that was predicted
-    formats: tuple[str, ...] = ("ply", "obj", "glb")
+    formats: tuple[str, ...] = ("ply", "obj", "glb")  # of the files
     frames: int | None = None  # this many, evenly spaced; all of them if null
     poisson: PoissonConfig = field(default_factory=PoissonConfig)
 

@@ -32,7 +32,7 @@ class FitConfig:
     name: str = "fitted"
     steps: int = 401  # POP
     code_lr: float = 5e-4  # POP; divided by ten for the second half
-    points: int = 50000
+    points: int = 50000  # template points predicted
     scan_points: int = 40000
     seed: int = 0
     loss: LossConfig = field(default_factory=lambda: LossConfig(normal_start=0.0))

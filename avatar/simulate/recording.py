@@ -55,12 +55,12 @@ class SimulateConfig:
     root: Path = Path(
         "data/open"
     )  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>
-    outfits: list[str] = field(default_factory=list)
+    outfits: list[str] = field(default_factory=list)  # tee, dress, shirt, skirt, jacket
     shapes: list[FileName] = field(default_factory=list)  # who wears them: female, male, files of tools/make_body.py
     train: int | None = None  # settled frames of random poses
     test: int | None = None  # settled frames of authored sequences
     train_motions: list[FileName] = field(default_factory=list)  # names of authored sequences, AMASS npz or BVH files
-    test_motions: list[FileName] = field(default_factory=list)
+    test_motions: list[FileName] = field(default_factory=list)  # the same for the test split
     settled: bool = False  # record motion files as settled poses, spread over them, not as continuous sequences
     fps: float = 30.0  # frames per second of continuous sequences
     seconds: float = 6.0  # longest part taken of a sequence

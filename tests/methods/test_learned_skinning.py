@@ -169,7 +169,7 @@ def test_skinning_is_that_of_each_outfits_folder(settings, loaded, tiny_outfit):
 
 
 def test_a_canonicalizer_that_is_missing_or_anothers_is_refused(settings, tiny_outfit, tmp_path):
-    command = r"python tools/canonicalize\.py dataset=open outfit=tiny name=other"
+    command = r"\S*python tools/canonicalize\.py dataset=open outfit=tiny name=other"
     for config in (replace(settings, canonical="other"), replace(settings, canonical="other", space=Space.canonical)):
         with pytest.raises(DataError, match=rf"canonicalizer of tiny, there is none\. Make it: {command}"):
             train_run(config)

@@ -1,0 +1,81 @@
+"""The help of every verb: what it says, and that it costs little."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from avatar.arguments import known_options
+from avatar.config import CONF, register
+from avatar.declared import declared
+from avatar.help import help_text, main_option, meanings
+from avatar.verbs import SHARED, VERBS
+
+ROOT = Path(__file__).parents[1]
+WITH_OPTIONS = [verb for verb, entry in VERBS.items() if entry.options]
+SECONDS = 2.0  # of processor time
+
+
+def ask(*words: str) -> tuple[int, str, str, float]:
+    """Exit code, output, errors and processor seconds of a verb, with what it imported among the errors."""
+    line = [sys.executable, "-X", "importtime", "-m", "avatar", *words]
+    process = subprocess.Popen(line, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    out, err = process.communicate(timeout=100)
+    return process.returncode, out, err, children_seconds()
+
+
+def children_seconds() -> float:
+    """Processor time of all processes that this one has waited for."""
+    times = os.times()
+    return times.children_user + times.children_system
+
+
+@pytest.mark.parametrize("verb", ["--help", *VERBS])
+def test_help_needs_neither_torch_nor_two_seconds(verb):
+    before = children_seconds()
+    code, out, err, after = ask(*([verb] if verb == "--help" else [verb, "--help"]))
+    assert code == 0 and out.startswith("usage: ") and " torch\n" not in err and " scipy\n" not in err
+    assert after - before < SECONDS
+
+
+def test_a_mistake_is_found_before_torch_is_imported():
+    for words in (("train", "train.stepz=1"), ("train", "train.steps=many"), ("predict", "run=nowhere")):
+        code, _, err, _ = ask(*words)
+        assert code == 2 and " torch\n" not in err
+
+
+@pytest.mark.parametrize("verb", WITH_OPTIONS)
+def test_the_options_that_matter_exist_and_mean_something(verb):
+    register(verb)
+    options, choices = known_options(verb, [], CONF)
+    known = meanings(declared(VERBS[verb].settings), options)
+    assert len(VERBS[verb].options.split()) <= 12
+    for name in VERBS[verb].options.split():
+        assert main_option(name, options, choices, known, CONF)[1], name
+
+
+def test_shared_meanings_are_of_options_that_lack_one():
+    known: dict[str, list[str]] = {name: [] for name in SHARED}
+    for verb in WITH_OPTIONS:
+        register(verb)
+        options, _ = known_options(verb, [], CONF)
+        for name, meaning in meanings(declared(VERBS[verb].settings), options).items():
+            known.setdefault(name, []).append(meaning)
+    assert all(known[name].count(meaning) > 1 for name, meaning in SHARED.items() if name != "seed")
+
+
+def test_help_shows_what_the_command_line_chooses():
+    register("train")
+    text = help_text("train", VERBS["train"], ["method=pop", "train.minutes=3"], CONF)
+    assert re.search(r"\n  method=pop +POP: features in the UV plane", text) and "\n  train.minutes=3  " in text
+    assert "\n    closet_learned    CloSET skinned by" in text and "\n      map_size: 64" in text
+    assert "\n      chamfer: plane  # point, plane\n" in text and "method_size" not in text and "_defaults" not in text
+    assert text.index("train.minutes=3") < text.index("All options:") < text.index("Options are written NAME=VALUE")
+
+
+def test_help_of_a_mistyped_option_is_a_hint():
+    code, out, err, _ = ask("train", "methd=pop", "--help")
+    assert code == 2 and out == "" and "methd: no such option. Did you mean 'method" in err
