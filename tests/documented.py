@@ -53,6 +53,7 @@ FILLED = {
     "<run folder>": [FIRST],
     "<motion>": ["walk"],
     "<folder>": ["theirs"],
+    "<seed>": ["0"],
     "<name>": ["csf"],
     "<table>": ["closet5"],
     "run=...": [f"run={folder}" for folder in TABLE],
