@@ -201,5 +201,5 @@ def refuse_machinery(path: Path, name: Path) -> None:
     headers = [line for line in text.splitlines() if "@package" in line]
     for word in (*check_events(path, text), *headers, str(name)):
         if any(sign in word for sign in ("hydra", "_target_", "()")) or re.search(r"\$\{[^}]*:", word):
-            mend = "Options of verbs are all that a configuration from elsewhere may set."
-            raise DataError(path, f"{word!r:.100} could run code or read the environment: not read.", mend)
+            hint = "Options of verbs are all that a configuration from elsewhere may set."
+            raise DataError(path, f"{word!r:.100} could run code or read the environment: not read.", hint)

@@ -24,9 +24,9 @@ class AvatarError(ValueError):
 class DataError(AvatarError):
     """A file that is missing, damaged or does not hold what it should."""
 
-    def __init__(self, path: str | Path, problem: str, mend: str = ""):
+    def __init__(self, path: str | Path, problem: str, hint: str = ""):
         self.path = Path(path)
-        super().__init__(sentences(f"{path}: {problem}", mend, nearest_folder(self.path)))
+        super().__init__(sentences(f"{path}: {problem}", hint, nearest_folder(self.path)))
 
 
 def sentences(*parts: str) -> str:

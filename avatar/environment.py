@@ -1,4 +1,4 @@
-"""What this machine has, what it lacks and the line that mends it, and how it is used well."""
+"""What this machine has, what it lacks and the command that installs it, and how it is used well."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Finding:
     name: str
     present: bool
     seen: str
-    mend: str = ""
+    hint: str = ""
     needed: bool = True
 
 
@@ -83,11 +83,11 @@ def inspect_package(name: str, use: str, needed: bool) -> Finding:
             version = "installed"
         return Finding(f"{name} ({use})", True, version, needed=needed)
     last = (result.stderr.strip().splitlines() or [f"the process died with code {result.returncode}"])[-1]
-    return Finding(f"{name} ({use})", False, last, mending_line(name, last), needed)
+    return Finding(f"{name} ({use})", False, last, install_hint(name, last), needed)
 
 
-def mending_line(package: str, message: str) -> str:
-    """The command that mends a failed import: a system library's package when one is named, else pip."""
+def install_hint(package: str, message: str) -> str:
+    """The command that repairs a failed import: a system library's package when one is named, else pip."""
     library = re.search(r"(lib[\w.+-]+\.so[\w.]*)", message)
     for stem, apt in APT_PACKAGES.items():
         if library and library.group(1).startswith(stem):

@@ -39,7 +39,7 @@ def doctor() -> None:
     findings = inspect_machine()
     for finding in findings:
         mark = "ok " if finding.present else ("MISSING" if finding.needed else "absent ")
-        print(f"{mark:8}{finding.name:42}{finding.seen}" + ("" if finding.present else f"\n{'':8}-> {finding.mend}"))
+        print(f"{mark:8}{finding.name:42}{finding.seen}" + ("" if finding.present else f"\n{'':8}-> {finding.hint}"))
     lacking = [finding.name for finding in findings if finding.needed and not finding.present]
     if not lacking:
         print(f"training would run on: {accelerator()}")

@@ -102,9 +102,9 @@ class Scan:
 
 @dataclass(frozen=True)
 class CanonicalScan:
-    """A posed scan carried to the canonical pose: a partial T-pose scan (SCANimate 3.1).
+    """A posed scan unposed to the canonical pose: a partial T-pose scan (SCANimate 3.1).
 
-    ``points (M, 3)`` metres, ``normals (M, 3)`` unit, ``weights (M, J)`` the skinning weights it was carried with,
+    ``points (M, 3)`` metres, ``normals (M, 3)`` unit, ``weights (M, J)`` the skinning weights it was unposed with,
     ``faces (F, 3)`` without those that were stretched where the scan is a mesh, ``colors (M, 3)`` where it has them.
     Points whose triangles were all cut are left out; ``source (M,)`` is the index of each in the posed scan.
     """

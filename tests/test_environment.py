@@ -1,4 +1,4 @@
-"""The doctor: what is there, what is missing, and the line that mends it."""
+"""The doctor: what is there, what is missing, and the command that installs it."""
 
 import inspect
 import os
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from avatar.environment import inspect_package, mending_line
+from avatar.environment import inspect_package, install_hint
 from avatar.invocation import interpreter
 from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
 from avatar.runs.fitting import fit_outfit
@@ -33,7 +33,7 @@ def test_a_missing_package_comes_with_its_install_line():
     finding = inspect_package("no_such_package_here", "nothing", needed=True)
     assert not finding.present
     assert "No module named" in finding.seen
-    assert finding.mend.endswith("python -m pip install no_such_package_here")
+    assert finding.hint.endswith("python -m pip install no_such_package_here")
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_a_missing_package_comes_with_its_install_line():
     ],
 )
 def test_a_missing_library_is_mended_by_its_package(message, line):
-    assert mending_line("open3d", message).startswith(line)
+    assert install_hint("open3d", message).startswith(line)
 
 
 def in_fresh_python(code: str, *arguments: str, **variables: str) -> subprocess.CompletedProcess:

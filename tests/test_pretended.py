@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FILES = ("tests/test_devices.py", "tests/geometry/test_bags.py", "tests/geometry/test_neighbours.py")
+FILES = ("tests/test_devices.py", "tests/geometry/test_sparse.py", "tests/geometry/test_neighbours.py")
 
 
 @pytest.mark.slow

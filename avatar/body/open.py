@@ -93,6 +93,6 @@ def open_body(shape: str = "female", canonical_pose: Tensor | None = None) -> Bo
 def _asset(keys: dict[str, str], optional: dict[str, str] | None = None) -> dict[str, np.ndarray]:
     """Arrays of the asset."""
     if not ASSET.is_file():
-        mend = f"Reinstall, or run tools/export_body.py {ASSET}."
-        raise DataError(ASSET, "the open body's asset is missing.", mend)
+        hint = f"Reinstall, or run tools/export_body.py {ASSET}."
+        raise DataError(ASSET, "the open body's asset is missing.", hint)
     return read_arrays(ASSET, keys, optional)

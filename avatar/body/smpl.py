@@ -139,24 +139,24 @@ def converted_kind(path: Path) -> str:
         return str(read_arrays(path, {"kind": "text 1"})["kind"][0])
     except DataError as error:
         line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path))}"
-        mend = f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"
-        raise DataError(path, str(error).removeprefix(f"{path}: "), mend) from error
+        hint = f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"
+        raise DataError(path, str(error).removeprefix(f"{path}: "), hint) from error
 
 
 def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
     """The arrays of a converted model, or an error that says how to come by one."""
-    mend = way_to_file(kind or "smplx", path)
+    hint = way_to_file(kind or "smplx", path)
     if not Path(path).is_file():
-        raise DataError(path, f"expected a converted {kind or 'SMPL-family'} body model, there is no such file.", mend)
+        raise DataError(path, f"expected a converted {kind or 'SMPL-family'} body model, there is no such file.", hint)
     try:
         model = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
     except DataError as error:
-        raise DataError(path, str(error).removeprefix(f"{path}: "), mend) from error
+        raise DataError(path, str(error).removeprefix(f"{path}: "), hint) from error
     stored = str(model["kind"][0])
     if kind not in (None, stored):
-        raise DataError(path, f"expected a {kind} body model, got {stored}.", mend)
+        raise DataError(path, f"expected a {kind} body model, got {stored}.", hint)
     if stored not in EXTRA_JOINTS or tuple(model["parents"]) != joint_tree(stored)[1]:
-        raise DataError(path, f"expected the joints of smpl, smplh or smplx, got {stored} with others.", mend)
+        raise DataError(path, f"expected the joints of smpl, smplh or smplx, got {stored} with others.", hint)
     return model
 
 

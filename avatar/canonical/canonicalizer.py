@@ -12,7 +12,7 @@ from avatar.body.skinning import skin_transforms
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
 from avatar.canonical.posed import ScanBatch
 from avatar.checks import AvatarError
-from avatar.geometry.bags import pick
+from avatar.geometry.sparse import pick
 from avatar.geometry.transforms import invert_affine, transform_points
 from avatar.records import Template
 

@@ -1,4 +1,4 @@
-"""Posed scans carried to the canonical pose, without the triangles that this tears (SCANimate 3.1, appendix A.4)."""
+"""Posed scans unposed to the canonical pose, without the triangles that this tears (SCANimate 3.1, appendix A.4)."""
 
 from __future__ import annotations
 

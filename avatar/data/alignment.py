@@ -46,26 +46,26 @@ def measure_overlap(points: np.ndarray, normals: np.ndarray, vertices: np.ndarra
     )
 
 
-def suggest_mend(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> str:
+def suggest_hint(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> str:
     """What would lay a scan over its body: a move, a turn by right angles, a mirror; or that none of them does."""
     centres, _, areas = _face_frames(vertices, faces)
     skin = centres[_spread(areas, SKIN_SAMPLES)]
     tree, reach = _scan_tree(points)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    best, words, mended = 0.0, "", points
+    best, words, corrected = 0.0, "", points
     for name, linear in _mistakes():
         moved = skin @ linear  # the inverse of an orthogonal matrix is its transpose: the body goes to the scan
         if name and (share := _covered(moved, tree, reach)) > best:
-            best, words, mended = share, name, points @ linear.T
+            best, words, corrected = share, name, points @ linear.T
         shift = middle - (moved.min(axis=0) + moved.max(axis=0)) / 2
         share = _covered(moved + shift, tree, reach)
         if share > best + 0.02:  # a suggestion without a move is the simpler one
             back = -linear @ shift
             numbers = ", ".join(f"{step:.2f}" for step in back)
             words = f"{name} and moving it by ({numbers}) m" if name else f"Moving it by ({numbers}) m"
-            best, mended = share, points @ linear.T + back
-    if best < CURED or measure_overlap(mended, normals, vertices, faces).buried > CURED_BURIED:
-        return "Neither a move, a turn by right angles nor a mirror mends it: is the fit of another frame or person?"
+            best, corrected = share, points @ linear.T + back
+    if best < CURED or measure_overlap(corrected, normals, vertices, faces).buried > CURED_BURIED:
+        return "Neither a move, a turn by right angles nor a mirror corrects it: is the fit of another frame or person?"
     return f"{words} would lay it over the body; or do the reverse to the fit."
 
 

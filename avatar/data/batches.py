@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from avatar.checks import AvatarError
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import frame_seed
-from avatar.data.streaming import ROOM, Streamed
+from avatar.data.streaming import MAX_BYTES, LruSequence
 from avatar.records import Batch, Frame
 
 
@@ -53,7 +53,7 @@ class FrameDataset(Dataset):
         names: Sequence[FrameName],
         points: int,
         seed: int = 0,
-        cache_bytes: int = ROOM,
+        cache_bytes: int = MAX_BYTES,
     ):
         """Prepares frames; none is read yet.
 
@@ -77,7 +77,7 @@ class FrameDataset(Dataset):
                 )
         self.outfits, self.names, self.points, self.seed = tuple(outfits), tuple(names), points, seed
         self.epoch = 0  # the epoch that plain indexing draws scan points for
-        self.frames = Streamed(self._read, len(self.names), cache_bytes)
+        self.frames = LruSequence(self._read, len(self.names), cache_bytes)
 
     def __len__(self) -> int:
         return len(self.names)

@@ -29,7 +29,7 @@ class CanonicalOutfit(Outfit):
 
     @property
     def body(self) -> BodyModel | None:
-        """The wearer's body."""
+        """The subject's body."""
         return self.posed.body
 
     @property

@@ -69,19 +69,19 @@ def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Te
     turn, _ = Rotation.align_vectors(vertices - middle, posed - other)
     turned = turn.apply(posed - other) + middle
     if _apart(posed + middle - other, vertices) <= APART:
-        mend = f"A move of ({', '.join(f'{s:.2f}' for s in middle - other)}) m would: is the translation right?"
+        hint = f"A move of ({', '.join(f'{s:.2f}' for s in middle - other)}) m would: is the translation right?"
     elif _apart(turned, vertices) <= APART:
         degrees = np.degrees(turn.magnitude())
-        mend = f"Turning the whole body by {degrees:.0f} degrees would: is the root's rotation in both?"
+        hint = f"Turning the whole body by {degrees:.0f} degrees would: is the root's rotation in both?"
     else:
         off = np.linalg.norm(turned - vertices, axis=1) > APART
         joint = template.joint_names[int(template.weights.numpy()[off].sum(axis=0).argmax())]
-        mend = (
+        hint = (
             f"Vertices of {joint} are off most. Is {what} this frame's, with joints in the template's order, not "
             "negated and not zeros, and are the template's shape (betas), weights and joints this person's?"
         )
     problem = f"{what}: expected it to put the template on the frame's body, it leaves {1 - SHARE:.0%} of the vertices"
-    raise DataError(path, f"{problem} {apart:.3f} m or more away.", mend)
+    raise DataError(path, f"{problem} {apart:.3f} m or more away.", hint)
 
 
 def check_carried(transforms: np.ndarray, template: Template, vertices: np.ndarray, path: Path) -> None:
@@ -115,16 +115,16 @@ def check_carried(transforms: np.ndarray, template: Template, vertices: np.ndarr
         return
     turn, _ = Rotation.align_vectors(posed, carried)
     if backwards:
-        mend = "Transposed it does: store posed_from_rest, not its inverse, in matrices that multiply columns."
+        hint = "Transposed it does: store posed_from_rest, not its inverse, in matrices that multiply columns."
     elif error(turn.apply(carried)) <= EDGE_ERROR:
         degrees = np.degrees(turn.magnitude())
-        mend = f"Turned by {degrees:.0f} degrees as a whole it does: is the root's rotation in both?"
+        hint = f"Turned by {degrees:.0f} degrees as a whole it does: is the root's rotation in both?"
     elif np.abs(linear - np.eye(3)).max() < 1e-3:
-        mend = "It is the identity: bring this frame's transforms, or leave the key out where pose is there."
+        hint = "It is the identity: bring this frame's transforms, or leave the key out where pose is there."
     else:
-        mend = "Is it this frame's, from rest to pose, in the template's order of vertices?"
+        hint = "Is it this frame's, from rest to pose, in the template's order of vertices?"
     problem = f"vtransf: expected it to turn the template's edges onto those of the body, it errs by {found:.0%}"
-    raise DataError(path, f"{problem} of their length.", mend)
+    raise DataError(path, f"{problem} of their length.", hint)
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> float:

@@ -27,7 +27,7 @@ from avatar.records import BodyFit, Frame, Scan, Template
 
 @dataclass(frozen=True)
 class OpenBody:
-    """The wearer as ``outfit.yaml`` names it: a ``shape`` of the open body or a ``body.npz`` of the same topology
+    """The subject as ``outfit.yaml`` names it: a ``shape`` of the open body or a ``body.npz`` of the same topology
     (``shape`` None), and the ``canonical`` pose ``t`` or ``apart``.
     """
 
@@ -65,7 +65,7 @@ class OpenOutfit(SurfaceOutfit):
 
     @cached_property
     def body(self) -> BodyModel:
-        """The wearer."""
+        """The subject."""
         if self._described.shape is not None:
             return self._make_body(self._described.shape)
         path = self.path / "body.npz"

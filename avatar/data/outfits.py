@@ -16,7 +16,7 @@ import torch
 from avatar.body.model import BodyModel
 from avatar.checks import SAFE_NAME, AvatarError, DataError, check_name, did_you_mean, sentences
 from avatar.data.consistency import check_joints
-from avatar.data.soundness import check_frame, check_pose, check_template
+from avatar.data.validation import check_frame, check_pose, check_template
 from avatar.io.documents import read_yaml
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Scan, Template
@@ -115,24 +115,24 @@ class Outfit(ABC):
     @property
     @abstractmethod
     def body(self) -> BodyModel | None:
-        """The wearer's body, or None where the outfit has only a mesh of it, which cannot be posed."""
+        """The subject's body, or None where the outfit has only a mesh of it, which cannot be posed."""
 
     @property
     def mean_body(self) -> BodyModel | None:
-        """The body a pose encoder sees in place of the wearer's: the mean shape where the data has it."""
+        """The body a pose encoder sees in place of the subject's: the mean shape where the data has it."""
         return self.body
 
     def posable_body(self) -> BodyModel:
-        """The wearer's body. Raises `DataError` where there is only a mesh."""
+        """The subject's body. Raises `DataError` where there is only a mesh."""
         if self.body is None:
             problem = "posing needs skinning weights and joints, and there is only template.obj."
-            mend = "Add your own SMPL-family body: python tools/convert_body.py <downloaded file> template.npz."
-            raise DataError(self.path, problem, mend)
+            hint = "Add your own SMPL-family body: python tools/convert_body.py <downloaded file> template.npz."
+            raise DataError(self.path, problem, hint)
         return self.body
 
     @torch.no_grad()
     def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
-        """The wearer in any pose; what a pose encoder sees of it is in mean shape, with the root at rest.
+        """The subject in any pose; what a pose encoder sees of it is in mean shape, with the root at rest.
 
         Args:
             pose: ``(J, 3)`` axis-angle, radians, relative to the parent and to the T-pose.
@@ -227,12 +227,12 @@ def outfit_folder(root: Path, dataset: str, outfit: str) -> Path:
         parent = parent / "packed"
     if not parent.is_dir():
         near = did_you_mean(dataset, ["sample", *(path.name for path in Path(root).glob("*/"))])
-        mend = f"Make it with tools/simulate.py, or put the data there as {parent}/<outfit>/train/*.npz."
-        raise DataError(parent, f"expected the folder of data set {dataset}, there is none.", sentences(near, mend))
+        hint = f"Make it with tools/simulate.py, or put the data there as {parent}/<outfit>/train/*.npz."
+        raise DataError(parent, f"expected the folder of data set {dataset}, there is none.", sentences(near, hint))
     there = outfit_names(parent)
     if outfit not in there:
-        mend = sentences(did_you_mean(outfit, there), f"There are: {', '.join(there) or 'none'}.")
-        raise DataError(parent / outfit, "no such outfit.", mend)
+        hint = sentences(did_you_mean(outfit, there), f"There are: {', '.join(there) or 'none'}.")
+        raise DataError(parent / outfit, "no such outfit.", hint)
     folder = parent / outfit
     if not folder.resolve().is_relative_to(parent.resolve()):
         raise DataError(folder, f"expected a folder inside {parent}, it is a link to {folder.resolve()}.")

@@ -18,7 +18,7 @@ from avatar.body.skinning import blend_transforms, skin_transforms
 from avatar.checks import AvatarError, DataError, check_shape, require
 from avatar.data.consistency import check_carried, check_posed
 from avatar.data.outfits import OUTFIT_FORMAT, SPLITS, Outfit, read_outfit_settings
-from avatar.data.soundness import check_pose, check_size
+from avatar.data.validation import check_pose, check_size
 from avatar.geometry.transforms import invert_rigid, transform_points
 from avatar.io.atlases import read_obj_atlas
 from avatar.io.frames import write_manifest
@@ -118,9 +118,9 @@ class PackedOutfit(Outfit):
             ("joint_transforms", joints),
         ):
             if key in stored and len(stored[key]) != expected:
-                mend = "The frame belongs to another body than the template."
+                hint = "The frame belongs to another body than the template."
                 raise DataError(
-                    path, f"{key}: expected {expected} rows as in the template, got {len(stored[key])}.", mend
+                    path, f"{key}: expected {expected} rows as in the template, got {len(stored[key])}.", hint
                 )
         if "pose" in stored:
             stored["pose"] = _stored_pose(stored["pose"], self.template.joint_names, path)
@@ -202,8 +202,8 @@ class PackedOutfit(Outfit):
             return stored["joint_transforms"]
         if self.body is None:
             if "vtransf" not in stored or "body_verts" not in stored:
-                mend = "Bring them, or put a template.npz with skinning weights beside the frames."
-                raise DataError(path, "expected body_verts and vtransf, as the template has no joints.", mend)
+                hint = "Bring them, or put a template.npz with skinning weights beside the frames."
+                raise DataError(path, "expected body_verts and vtransf, as the template has no joints.", hint)
             return np.eye(4, dtype=np.float32)[None]
         if posed is not None:
             return posed.joint_transforms
@@ -294,8 +294,8 @@ def _template_of_mesh(path: Path) -> Template:
     if not path.is_file():
         problem = "expected template.npz or template.obj (the minimal body in its T-pose), there is neither."
         target = shlex.quote(str(path.with_suffix(".npz")))
-        mend = f"Make one: python tools/convert_body.py <downloaded SMPL file> {target}"
-        raise DataError(path.parent, problem, mend)
+        hint = f"Make one: python tools/convert_body.py <downloaded SMPL file> {target}"
+        raise DataError(path.parent, problem, hint)
     mesh = read_mesh(path)
     faces = np.asarray(mesh.faces, np.int64)
     atlas = read_obj_atlas(path, faces, len(mesh.vertices))

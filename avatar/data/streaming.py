@@ -1,4 +1,4 @@
-"""Sequences that stay on the disk: items are read when they are asked for, and kept while there is room for them."""
+"""Sequences that stay on the disk: items are read when they are asked for, and kept while they fit into memory."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
-ROOM = 1 << 30  # bytes of one sequence's items kept in memory: with torch and a network's work below 2 GiB
+MAX_BYTES = 1 << 30  # bytes of one sequence's items kept in memory: with torch and a network's work below 2 GiB
 Item = TypeVar("Item")
 
 
-class Streamed(Sequence[Item]):
+class LruSequence(Sequence[Item]):
     """A sequence of any length in bounded memory; the least recently used items leave first.
 
     What an item is must follow from its index alone, for it may be read again.
     """
 
-    def __init__(self, read: Callable[[int], Item], count: int, room: int = ROOM):
+    def __init__(self, read: Callable[[int], Item], count: int, max_bytes: int = MAX_BYTES):
         """Prepares a sequence of ``count`` items; none is read yet.
 
         Args:
             read: gives an item, a dataclass of arrays or tensors, by its index.
             count: how many there are.
-            room: bytes that items may be kept in.
+            max_bytes: bytes that items may be kept in.
         """
-        self.read, self.count, self.left = read, count, max(room, 0)
+        self.read, self.count, self.left = read, count, max(max_bytes, 0)
         self.kept: OrderedDict[int, Item] = OrderedDict()
 
     def __len__(self) -> int:

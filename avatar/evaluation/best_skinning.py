@@ -16,7 +16,7 @@ import torch
 from avatar.body.skinning import blend_transforms
 from avatar.checks import AvatarError, check_shape
 from avatar.data.scanner import DressedSurface
-from avatar.evaluation.canonical_truth import Canonicalized, carry_with
+from avatar.evaluation.canonical_truth import Canonicalized, unpose_with
 from avatar.geometry.transforms import invert_affine, transform_points
 from avatar.geometry.trees import build_tree
 from avatar.records import BodyFit, Frame, Template
@@ -74,11 +74,11 @@ class BestSkinning:
         return np.einsum("mk,mkj->mj", closeness, self.weights[ids]).astype(np.float32)
 
     def __call__(self, frame: Frame) -> Canonicalized:
-        """The frame's scan carried to the canonical pose with the weights of each point's true place."""
+        """The frame's scan unposed to the canonical pose with the weights of each point's true place."""
         scan = frame.scan
         if scan.canonical is None or scan.labels is None:
             raise AvatarError("scan: expected labels and canonical positions; only simulated data has the truth.")
-        carried = carry_with(self.weights_at(scan.canonical, scan.labels), frame, self.template)
+        carried = unpose_with(self.weights_at(scan.canonical, scan.labels), frame, self.template)
         return Canonicalized(carried, self.weights_at(carried.points, scan.labels))
 
 

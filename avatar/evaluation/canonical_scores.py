@@ -19,9 +19,9 @@ from avatar.evaluation.canonical_truth import (
     CONTACT,
     Canonicalized,
     FrameTruth,
-    carry_truly,
     frame_truth,
     repose,
+    unpose_truly,
 )
 from avatar.evaluation.closest import closest_on_mesh
 from avatar.evaluation.metrics import Metric
@@ -273,7 +273,7 @@ def _measure_frame(
     """Every metric of a frame, NaN where it does not have one, and the point count, for each method; None is `TRUE`."""
     truth, found = frame_truth(frame.scan, template), {}
     for label, carry in methods.items():
-        result = carry_truly(frame, truth, template) if carry is None else carry(frame)
+        result = unpose_truly(frame, truth, template) if carry is None else carry(frame)
         comparison = CanonicalComparison(frame, truth, result, template, surfaces)
         values = {name: float(metric.measure(comparison)) for name, metric in CANONICAL_METRICS.items()}
         found[label] = values, len(result.scan.points)

@@ -102,8 +102,8 @@ def repose(points: np.ndarray, weights: np.ndarray, body: BodyFit, template: Tem
     return transform_points(_posed_from_canonical(weights, body, template), torch.from_numpy(points)).numpy()
 
 
-def carry_with(weights: np.ndarray, frame: Frame, template: Template) -> CanonicalScan:
-    """A frame's scan carried to the canonical pose with given weights ``(M, J)`` of its points; nothing is cut."""
+def unpose_with(weights: np.ndarray, frame: Frame, template: Template) -> CanonicalScan:
+    """A frame's scan unposed to the canonical pose with given weights ``(M, J)`` of its points; nothing is cut."""
     scan, forth = frame.scan, _posed_from_canonical(weights, frame.body, template)
     points = transform_points(invert_affine(forth), torch.from_numpy(scan.points))
     normals = torch.einsum("nij,ni->nj", forth[:, :3, :3], torch.from_numpy(scan.normals))
@@ -117,9 +117,9 @@ def carry_with(weights: np.ndarray, frame: Frame, template: Template) -> Canonic
     )
 
 
-def carry_truly(frame: Frame, truth: FrameTruth, template: Template) -> Canonicalized:
+def unpose_truly(frame: Frame, truth: FrameTruth, template: Template) -> Canonicalized:
     """The canonicalization with the weights of the body under each point's true place."""
-    carried = carry_with(truth.weights, frame, template)
+    carried = unpose_with(truth.weights, frame, template)
     return Canonicalized(carried, weights_under(carried.points, template))
 
 

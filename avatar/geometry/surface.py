@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.bags import Bags, sum_bags
+from avatar.geometry.sparse import SparseRows, gather_sum
 from avatar.records import SurfaceSamples
 
 
@@ -71,8 +71,8 @@ def interpolate(values: Tensor, samples: SurfaceSamples) -> Tensor:
     Weighted sums of three rows: differentiable, and no ``(N, 3, C)`` array is ever made.
     """
     check_shape("values", values, "... V C")
-    bags = Bags.of_table(samples.vertex_ids, values.shape[-2], samples.barycentric)
-    return sum_bags(values, bags)
+    sparse = SparseRows.of_table(samples.vertex_ids, values.shape[-2], samples.barycentric)
+    return gather_sum(values, sparse)
 
 
 def interpolate_transforms(transforms: Tensor, samples: SurfaceSamples) -> Tensor:

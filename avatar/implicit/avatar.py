@@ -29,7 +29,7 @@ class PoseInput(Enum):
     """What the surface knows of the pose."""
 
     local = "local"  # joints near in the tree, gated by the skinning weights (SCANimate eq. 18)
-    global_ = "global"  # all joints everywhere: the rival
+    global_ = "global"  # all joints everywhere: the baseline
     none = "none"  # nothing: one shape for all poses, the static floor
 
 

@@ -11,7 +11,7 @@ from avatar.records import Template
 
 
 class BodyField(nn.Module):
-    """Weights of the nearest vertices of the canonical body, by inverse distance (SCANimate 4.1's rivals).
+    """Weights of the nearest vertices of the canonical body, by inverse distance (SCANimate 4.1's baselines).
 
     Stands where a learned forward skinning field would. Differentiable in the points but for changes of neighbours.
     """

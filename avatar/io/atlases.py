@@ -67,14 +67,14 @@ def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAt
     except (ValueError, UnicodeDecodeError) as error:
         raise DataError(path, f"cannot be read as OBJ ({error}).") from error
     if count != vertices:
-        mend = "Take the UV template of this body model, with all its vertices in their order."
-        raise DataError(path, f"expected the body's {vertices} vertices, got {count}: it is of another mesh.", mend)
+        hint = "Take the UV template of this body model, with all its vertices in their order."
+        raise DataError(path, f"expected the body's {vertices} vertices, got {count}: it is of another mesh.", hint)
     if not len(uv):
         return None
     low, high = float(uv.min()), float(uv.max())
     if not (low >= -ROUNDING and high <= 1 + ROUNDING):  # not so for NaN either
-        mend = "Pack the islands into one tile before exporting."
-        raise DataError(path, f"expected texture coordinates in [0, 1], got {low:.3g} to {high:.3g}.", mend)
+        hint = "Pack the islands into one tile before exporting."
+        raise DataError(path, f"expected texture coordinates in [0, 1], got {low:.3g} to {high:.3g}.", hint)
     return MeshAtlas(np.clip(uv, 0, 1), _match(path, polygons, faces))
 
 
@@ -120,9 +120,9 @@ def _match(path: Path, polygons: list[list[_Corner]], faces: np.ndarray) -> np.n
     found = [[known.get(frozenset(face), nothing)[vertex] for vertex in face] for face in faces.tolist()]
     bare = [number for number, places in enumerate(found) if None in places]
     if bare:
-        mend = "Unwrap the whole body, and export the triangles or quads of its model as they are."
+        hint = "Unwrap the whole body, and export the triangles or quads of its model as they are."
         problem = (
             f"{len(bare)} of the body's {len(faces)} triangles have no texture coordinates, the first is {bare[0]}"
         )
-        raise DataError(path, f"{problem} (vertices {', '.join(map(str, faces[bare[0]]))}).", mend)
+        raise DataError(path, f"{problem} (vertices {', '.join(map(str, faces[bare[0]]))}).", hint)
     return np.array(found, np.int64)

@@ -15,7 +15,7 @@ from torch.overrides import TorchFunctionMode
 from avatar.checks import AvatarError
 from avatar.io.checkpoints import restoring
 
-ROOM = 4  # times the numbers in a weights file: initialisation makes temporaries of a layer's size
+FACTOR = 4  # times the numbers in a weights file: initialisation makes temporaries of a layer's size
 SPARE = 1 << 22  # numbers beside them, 16 MiB: what a network draws, sorts and caches of its template
 FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.eye}
 
@@ -48,5 +48,5 @@ def building(path: Path, weights: Mapping[str, Tensor]) -> Iterator[None]:
     Raises:
         DataError: naming the file, when the settings ask for more than the weights hold, or the two do not fit.
     """
-    with restoring(path), Budget(ROOM * sum(value.numel() for value in weights.values()) + SPARE):
+    with restoring(path), Budget(FACTOR * sum(value.numel() for value in weights.values()) + SPARE):
         yield

@@ -233,8 +233,8 @@ def read_weights(path: Path, facts: Iterable[str] = ()) -> tuple[dict[str, Tenso
         raise DataError(described, f"expected a description with a sha256 and its facts; {missing[0]} is missing.")
     data = weights.read_bytes()
     if hashlib.sha256(data).hexdigest() != description["sha256"]:
-        mend = "Give the command that made it again."
-        raise DataError(weights, "damaged: its sha256 is not the one in its description.", mend)
+        hint = "Give the command that made it again."
+        raise DataError(weights, "damaged: its sha256 is not the one in its description.", hint)
     try:
         tensors = load_tensors(data)
         for name, value in tensors.items():

@@ -183,8 +183,8 @@ def _check_garment(garment: OpenGarment) -> None:
 def _check_format(path: Path, stored: dict[str, np.ndarray], expected: str) -> None:
     """Refuses a file of another format or version."""
     if str(stored["format"]) != expected:
-        mend = "Make the data again with this version, or use the version that wrote it."
-        raise DataError(path, f"expected format {expected}, got {stored['format']}.", mend)
+        hint = "Make the data again with this version, or use the version that wrote it."
+        raise DataError(path, f"expected format {expected}, got {stored['format']}.", hint)
 
 
 def _listed_files(folder: Path) -> dict[str, Path]:
@@ -221,16 +221,16 @@ def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
         raise DataError(path, f"expected format {MANIFEST_FORMAT}, got {manifest.get('format')}.")
     files = _listed_files(folder)
     for name in [*known, *(name for name in files if name not in known)]:
-        mend = "Make or download it again, or write the manifest anew if the change is meant."
+        hint = "Make or download it again, or write the manifest anew if the change is meant."
         if name not in files:
-            raise DataError(folder / name, "the manifest lists it, it is not there.", mend)
+            raise DataError(folder / name, "the manifest lists it, it is not there.", hint)
         if name not in known:
-            raise DataError(files[name], "it is not in the manifest.", mend)
+            raise DataError(files[name], "it is not in the manifest.", hint)
         size, digest = known[name]
         if files[name].stat().st_size != size:
-            raise DataError(files[name], f"expected {size} bytes, got {files[name].stat().st_size}.", mend)
+            raise DataError(files[name], f"expected {size} bytes, got {files[name].stat().st_size}.", hint)
         if verify_hashes and _sha256(files[name]) != digest:
-            raise DataError(files[name], "its sha256 is not the manifest's: the content has changed.", mend)
+            raise DataError(files[name], "its sha256 is not the manifest's: the content has changed.", hint)
 
 
 def _sha256(path: Path) -> str:

@@ -91,8 +91,8 @@ class Ledger:
                     lines = lines if stream.read(1) == b"\n" else b"\n" + lines  # behind a half-written line
                 stream.write(lines)
         except OSError as error:
-            mend = "Make room and give the same command again."
-            raise DataError(self.path, f"could not be written ({error.strerror}).", mend) from error
+            hint = "Make room and give the same command again."
+            raise DataError(self.path, f"could not be written ({error.strerror}).", hint) from error
         for entry in entries:
             self._keep(entry)
         WORK["made"] += len(entries)

@@ -204,5 +204,5 @@ def _check_upright(path: Path, bvh: BvhMotion) -> None:
     stretch = (bvh.positions[:, upper] - bvh.positions[:, legs].mean(axis=1)).mean(axis=0)
     share = stretch / max(np.linalg.norm(stretch), 1e-12)
     if share[1] < 0.5 and abs(share[2]) > 0.8:
-        mend = "Give up=z, or up=y if people really lie down."
-        raise DataError(path, "expected people upright along y, they are upright along z.", mend)
+        hint = "Give up=z, or up=y if people really lie down."
+        raise DataError(path, "expected people upright along y, they are upright along z.", hint)

@@ -60,8 +60,8 @@ def read_arrays(
             wanted = {**required, **{key: optional[key] for key in optional if key in members}}
             return {key: _read(path, archive, members[key], key, wanted[key], dims) for key in wanted}
     except DAMAGED as error:
-        mend = "Make or download it again."
-        raise DataError(path, f"expected a sound npz file, reading failed: {error}.", mend) from error
+        hint = "Make or download it again."
+        raise DataError(path, f"expected a sound npz file, reading failed: {error}.", hint) from error
 
 
 def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipfile.ZipInfo]:
@@ -181,8 +181,8 @@ def write_whole(path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         _replace(path, data)
     except OSError as error:
-        mend = "Make room and give the same command again."
-        raise DataError(path, f"could not be written ({error.strerror}; {len(data):,} bytes).", mend) from error
+        hint = "Make room and give the same command again."
+        raise DataError(path, f"could not be written ({error.strerror}; {len(data):,} bytes).", hint) from error
 
 
 def _replace(path: Path, data: bytes) -> None:

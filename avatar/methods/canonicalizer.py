@@ -44,7 +44,7 @@ from avatar.values import option
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
 CHUNK = 20_000  # points queried at once, or fewer where memory runs out
 POSES = "learned_poses"
-FRAMES_ROOM = 128 << 20  # bytes of whole frames kept; what is learned from them is kept by itself
+FRAMES_BYTES = 128 << 20  # bytes of whole frames kept; what is learned from them is kept by itself
 SAME_BODY = 1e-3  # metres between the vertices of a canonicalizer's body and an outfit's, at most
 SEED_STRIDE = 1_000_003
 
@@ -203,7 +203,7 @@ class CanonicalizeConfig:
     train: CycleConfig = field(default_factory=CycleConfig)
     stretch: float = STRETCH  # longest that an edge of a scan may become, as a multiple
     pictures: int = 4  # frames of each split in pictures
-    scored: int = 0  # frames of each split compared with their truth, beside both rivals; simulated outfits only
+    scored: int = 0  # frames of each split compared with their truth, beside both baselines; simulated outfits only
     device: str = "auto"  # auto takes CUDA where there is one
 
     def __post_init__(self):
@@ -229,7 +229,7 @@ class CanonicalizeConfig:
         names = name_frames([outfit], "train", [split_outfit(outfit, self.split).train])
         if outfit.has_frames("test"):
             names += name_frames([outfit], "test", [outfit.frames("test")])
-        return FrameDataset([outfit], names, points=1, cache_bytes=FRAMES_ROOM)
+        return FrameDataset([outfit], names, points=1, cache_bytes=FRAMES_BYTES)
 
 
 @dataclass(frozen=True)
@@ -280,8 +280,8 @@ def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicaliz
         DataError: when the folder is no finished run of learned weights, or a file in it is damaged.
     """
     if not (folder / f"{WEIGHTS}.json").is_file():
-        mend = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
-        raise DataError(folder, "no trained canonicalizer here.", mend)
+        hint = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
+        raise DataError(folder, "no trained canonicalizer here.", hint)
     weights, facts = read_weights(folder / WEIGHTS, ("config", "frames", "steps", "seconds"))
     with building(folder, weights):
         config = settings_from_dict(CanonicalizeConfig, facts["config"], f"{folder / WEIGHTS}.json: ")

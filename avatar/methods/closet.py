@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig
 from avatar.checks import AvatarError, check_shape
 from avatar.data.outfits import Outfit
-from avatar.geometry.bags import pick
+from avatar.geometry.sparse import pick
 from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.methods.base import CANONICALIZER, FitOptions, TrainedAvatar
@@ -44,7 +44,7 @@ FULL_GARMENT_ENCODER = {
 
 
 class Skinning(Enum):
-    """What carries the dressed surface from the canonical pose to a frame's."""
+    """Whose skinning poses the dressed surface from the canonical pose to a frame's."""
 
     body = "body"  # CloSET: the transform of the skin an offset starts from
     learned = "learned"  # SCANimate: a canonicalizer's field, asked at the offset point itself
@@ -178,7 +178,7 @@ class ClosetAvatar(nn.Module):
         scale = self.config.offset_scale
         offsets = (local.offsets * scale).float()
         apart = self.config.template and self.config.pose and wrinkles  # alone they are the whole, not a part of it
-        posed = self.carry(Decoded(offsets, local.normals.float()), batch, samples)
+        posed = self.pose_points(Decoded(offsets, local.normals.float()), batch, samples)
         return Prediction(
             points=posed.offsets,
             normals=posed.normals,
@@ -189,8 +189,8 @@ class ClosetAvatar(nn.Module):
             codes=codes,
         )
 
-    def carry(self, local: Decoded, batch: Batch, samples: SurfaceSamples) -> Decoded:
-        """Offsets from the skin, in metres, and normals carried to the batch's bodies: posed points, unit normals.
+    def pose_points(self, local: Decoded, batch: Batch, samples: SurfaceSamples) -> Decoded:
+        """Offsets from the skin, in metres, and normals posed with the batch's bodies: posed points, unit normals.
 
         In float32 whatever the network runs in: half precision is millimetres here.
 

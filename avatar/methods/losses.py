@@ -8,13 +8,13 @@ from enum import Enum
 from torch import Tensor
 
 from avatar.checks import AvatarError
-from avatar.geometry.bags import gather_rows
 from avatar.geometry.distances import (
     correspond,
     normal_difference,
     point_to_plane,
     point_to_point,
 )
+from avatar.geometry.sparse import gather_rows
 from avatar.records import Batch, LossTerms, Prediction
 
 TERMS = ("scan_to_points", "points_to_scan", "normal", "offset", "wrinkle", "wrinkle_normal", "code")

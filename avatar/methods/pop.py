@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.bags import pick
+from avatar.geometry.sparse import pick
 from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions
 from avatar.methods.points import PointMethod

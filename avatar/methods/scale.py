@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.bags import Bags, sum_bags
 from avatar.geometry.neighbours import nearest
 from avatar.geometry.sampling import farthest_points
+from avatar.geometry.sparse import SparseRows, gather_sum
 from avatar.geometry.surface import interpolate
 from avatar.geometry.transforms import transform_directions
 from avatar.geometry.uv import uv_barycentric
@@ -152,7 +152,7 @@ class ScaleAvatar(nn.Module):
         """What each patch knows of the pose: ``(B, V, 3)`` posed body to ``(B, P, C)``."""
         if self.config.pose_feature is PoseFeature.local:
             features = self.pose_encoder(self.atlas.position_map(pose_vertices)).flatten(2).transpose(1, 2)
-            return sum_bags(features, Bags.of_table(self.patch_pixels[:, None], features.shape[1]))
+            return gather_sum(features, SparseRows.of_table(self.patch_pixels[:, None], features.shape[1]))
         centres = interpolate(pose_vertices, self.patches)
         return self.pose_encoder(centres)[:, None].expand(-1, centres.shape[1], -1)
 
@@ -186,7 +186,7 @@ class ScaleAvatar(nn.Module):
         corners = self.patch_corners[patch]
         places = uv_and_patch((corners + 0.5) / size, spots - corners)
         features = self.pose_features(batch.pose_vertices)
-        features = sum_bags(features, Bags.of_table(patch[:, None], features.shape[1]))
+        features = gather_sum(features, SparseRows.of_table(patch[:, None], features.shape[1]))
         local = self.decoder(features, places)
         with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
             frames = self.patch_frames(batch.vertices)[:, patch]

@@ -17,7 +17,7 @@ from avatar.data.canonical_batches import CanonicalBatch, CanonicalFrame, Canoni
 from avatar.data.mirroring import mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
-from avatar.data.streaming import Streamed
+from avatar.data.streaming import LruSequence
 from avatar.environment import choose_device
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig, sample_mesh
 from avatar.implicit.body_field import BodyField
@@ -215,13 +215,13 @@ def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequen
             raise DataError(path, "this scan has no colours to learn.", "Set method.settings.avatar.colored=false.")
         return frame
 
-    return Streamed(read, len(names))
+    return LruSequence(read, len(names))
 
 
 def find_field(folder: Path, template: Template) -> nn.Module:
-    """The forward skinning field of a canonicalizer's run: the learned one, or the body's for its rivals.
+    """The forward skinning field of a canonicalizer's run: the learned one, or the body's for its baselines.
 
-    Rivals (nearest, knn) learn no field. Both are posed by the six nearest body vertices, for with the nearest one
+    Baselines (nearest, knn) learn no field. Both are posed by the six nearest body vertices, for with the nearest one
     alone the posed surface would tear wherever the neighbour changes.
     """
     path = folder / "config.yaml"

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.bags import Bags, sum_bags
+from avatar.geometry.sparse import SparseRows, gather_sum
 from avatar.geometry.uv import UVGrid, paint, rasterise_uv, sample_uv, uv_areas
 from avatar.records import SurfaceSamples, Template
 
@@ -93,10 +93,10 @@ class LookUp:
         across, down = torch.stack([1 - (places - low), places - low], dim=-1).unbind(dim=1)
         ids = (rows[:, :, None] * size + columns[:, None]).flatten(1)
         self.size = size
-        self.bags = Bags.of_table(ids, size**2, (down[:, :, None] * across[:, None]).flatten(1))
+        self.bags = SparseRows.of_table(ids, size**2, (down[:, :, None] * across[:, None]).flatten(1))
 
     @cached_property
-    def back(self) -> Bags:
+    def back(self) -> SparseRows:
         """The transposed sums, which the backward pass takes."""
         return self.bags.transpose()
 
@@ -104,7 +104,7 @@ class LookUp:
         """Features ``(B, N, C)`` of images ``(B, C, S, S)``."""
         check_shape("features", features, f"B C {self.size} {self.size}")
         rows = features.to(self.bags.weights.dtype).flatten(2).transpose(1, 2)
-        return sum_bags(rows, self.bags, self.back if rows.requires_grad else None)
+        return gather_sum(rows, self.bags, self.back if rows.requires_grad else None)
 
 
 def uv_and_patch(uv: Tensor, patch: Tensor) -> Tensor:

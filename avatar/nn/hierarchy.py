@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.bags import Bags, sum_bags
 from avatar.geometry.neighbours import ball_query, k_nearest
 from avatar.geometry.sampling import farthest_points
+from avatar.geometry.sparse import SparseRows, gather_sum
 
 
 @dataclass
@@ -32,10 +32,10 @@ class HierarchyConfig:
             )
 
 
-class FixedBags(nn.Module):
+class FixedRows(nn.Module):
     """Sums of bags that stay the same for good, with their transpose made once: ``(..., V, C)`` to ``(..., R, C)``."""
 
-    def __init__(self, bags: Bags):
+    def __init__(self, bags: SparseRows):
         super().__init__()
         self.rows, back = bags.rows, bags.transpose()
         self.register_buffer("ids", bags.ids, persistent=False)
@@ -46,9 +46,9 @@ class FixedBags(nn.Module):
         self.register_buffer("back_weights", back.weights, persistent=False)
 
     def forward(self, values: Tensor) -> Tensor:
-        bags = Bags(self.ids, self.starts, self.weights, self.rows)
-        back = Bags(self.back_ids, self.back_starts, self.back_weights, len(self.starts))
-        return sum_bags(values, bags, back)
+        bags = SparseRows(self.ids, self.starts, self.weights, self.rows)
+        back = SparseRows(self.back_ids, self.back_starts, self.back_weights, len(self.starts))
+        return gather_sum(values, bags, back)
 
 
 class Grouping(nn.Module):
@@ -57,7 +57,7 @@ class Grouping(nn.Module):
     def __init__(self, groups: Tensor, rows: int):
         super().__init__()
         self.shape = groups.shape
-        self.pick = FixedBags(Bags.of_table(groups.reshape(-1, 1), rows))
+        self.pick = FixedRows(SparseRows.of_table(groups.reshape(-1, 1), rows))
 
     def forward(self, values: Tensor) -> Tensor:
         return self.pick(values).unflatten(1, self.shape)
@@ -68,7 +68,7 @@ class Level(nn.Module):
 
     Buffers: ``positions (S, 3)`` of this level's points, ``finer_positions (N, 3)``, ``groups (S, K)`` ball-query
     neighbours in the finer level, ``up_ids (N, 3)`` and ``up_weights (N, 3)`` inverse-squared-distance weights of
-    the three nearest coarse points (PointNet++ eq. 2). ``group`` and ``spread`` are what is done with them.
+    the three nearest coarse points (PointNet++ eq. 2). ``group`` and ``interpolate_up`` are what is done with them.
     """
 
     def __init__(self, finer: Tensor, count: int, radius: float, neighbours: int):
@@ -85,7 +85,7 @@ class Level(nn.Module):
         }.items():
             self.register_buffer(name, value.clone(), persistent=False)
         self.group = Grouping(self.groups, len(finer))
-        self.spread = FixedBags(Bags.of_table(self.up_ids, count, self.up_weights))
+        self.interpolate_up = FixedRows(SparseRows.of_table(self.up_ids, count, self.up_weights))
 
 
 def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:

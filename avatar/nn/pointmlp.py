@@ -6,10 +6,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-from avatar.geometry.bags import Bags
 from avatar.geometry.neighbours import k_nearest
 from avatar.geometry.precision import widen
-from avatar.nn.hierarchy import FixedBags, Level, build_levels
+from avatar.geometry.sparse import SparseRows
+from avatar.nn.hierarchy import FixedRows, Level, build_levels
 from avatar.nn.pointnet2 import PointNet2Config, PointNorm, SurfaceEncoder
 from avatar.nn.wide import WideLinear
 from avatar.records import Template
@@ -60,7 +60,7 @@ class PointMLPLevel(nn.Module):
         *inner, width = widths
         self.level = level
         own = k_nearest(level.positions[None], level.finer_positions[None], 1)[0, :, 0]
-        self.own = FixedBags(Bags.of_table(own[:, None], len(level.finer_positions)))  # each centre in the finer level
+        self.own = FixedRows(SparseRows.of_table(own[:, None], len(level.finer_positions)))  # centres
         self.affine = GeometricAffine(channels + 3)
         self.difference_layer = nn.Linear(channels + 3, width, bias=False)
         self.centre_layer = WideLinear(channels + 3, width)

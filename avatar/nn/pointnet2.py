@@ -107,7 +107,7 @@ class FeaturePropagation(nn.Module):
         """``(B, S, C)`` and ``(B, N, C')`` to ``(B, N, C'')``."""
         first, *rest = self.mlp
         mixing, adding = first.weight.split([coarse.shape[-1], fine.shape[-1]], dim=1)
-        lifted = self.level.spread(linear(coarse, mixing)) + wide_linear(fine, adding, first.bias)
+        lifted = self.level.interpolate_up(linear(coarse, mixing)) + wide_linear(fine, adding, first.bias)
         for layer in rest:
             lifted = layer(lifted)
         return lifted

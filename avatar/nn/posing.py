@@ -9,43 +9,43 @@ from torch import Tensor, nn
 
 from avatar.body.skinning import skin_transforms
 from avatar.checks import AvatarError
-from avatar.geometry.bags import pick
+from avatar.geometry.sparse import pick
 from avatar.geometry.surface import interpolate
 from avatar.records import SurfaceSamples, Template
 
 
 class LearnedSkinning(nn.Module):
-    """Forward skinning with one field an outfit (SCANimate 3.1), on the wearer's own body.
+    """Forward skinning with one field an outfit (SCANimate 3.1), on the subject's own body.
 
     A skirt's points hang far from the skin they belong to on the template; with the body's weights they follow that
     skin and tear between the legs. A field is asked at the offset point itself.
 
     A run's template is the mean of its outfits' bodies, while a field and the joint transforms of a frame belong to
-    one wearer; so each outfit's own canonical body stands here, in the state that is saved with the weights.
+    one subject; so each outfit's own canonical body stands here, in the state that is saved with the weights.
     """
 
-    def __init__(self, fields: Sequence[nn.Module], wearers: Sequence[Template], trainable: bool = False):
+    def __init__(self, fields: Sequence[nn.Module], subjects: Sequence[Template], trainable: bool = False):
         """Takes an outfit's field and body from the same place of two lists.
 
         Args:
             fields: called as ``field(points (B, N, 3)) -> weights (B, N, J)`` on canonical points.
-            wearers: bodies at rest, of one topology.
+            subjects: bodies at rest, of one topology.
             trainable: whether training moves the fields too.
 
         Raises:
             AvatarError: when there is not one field an outfit.
         """
         super().__init__()
-        if not wearers or len(fields) != len(wearers):
-            raise AvatarError(f"fields: expected one for each of {len(wearers)} outfits, got {len(fields)}.")
+        if not subjects or len(fields) != len(subjects):
+            raise AvatarError(f"fields: expected one for each of {len(subjects)} outfits, got {len(fields)}.")
         self.fields = nn.ModuleList(fields).requires_grad_(trainable)
-        binds = [body.canonical_from_bind for body in wearers]
-        still = torch.eye(4).to(wearers[0].vertices).expand(len(wearers[0].parents), 4, 4)
-        self.register_buffer("vertices", torch.stack([body.vertices for body in wearers]))
+        binds = [body.canonical_from_bind for body in subjects]
+        still = torch.eye(4).to(subjects[0].vertices).expand(len(subjects[0].parents), 4, 4)
+        self.register_buffer("vertices", torch.stack([body.vertices for body in subjects]))
         self.register_buffer("binds", torch.stack([still if bind is None else bind for bind in binds]))
 
     def skin(self, outfit_ids: Tensor, samples: SurfaceSamples) -> Tensor:
-        """The wearers' bodies at rest at the sampled template points, ``(B,)`` to ``(B, N, 3)``."""
+        """The subjects' bodies at rest at the sampled template points, ``(B,)`` to ``(B, N, 3)``."""
         return interpolate(self.vertices[outfit_ids], samples)
 
     def forward(self, points: Tensor, joint_transforms: Tensor, outfit_ids: Tensor) -> Tensor:

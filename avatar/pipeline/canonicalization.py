@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avatar.canonical.rivals import SkinningSource
+from avatar.canonical.baselines import SkinningSource
 from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset
@@ -72,7 +72,7 @@ def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
 
 
 def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> Scores:
-    """Writes ``<run>/scores.csv`` and ``scores.md``: this run, both rivals and the true weights on some frames.
+    """Writes ``<run>/scores.csv`` and ``scores.md``: this run, both baselines and the true weights on some frames.
 
     Variants are the splits: frames of training were learned from, those of test found their codes alone. What was
     measured before is measured again only where a scan, a canonicalizer or the code of either has changed.

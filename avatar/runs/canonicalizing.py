@@ -7,14 +7,14 @@ from pathlib import Path
 import torch
 
 from avatar.body.packed import write_template
+from avatar.canonical.baselines import KNN, NearestBody, SkinningSource
 from avatar.canonical.canonicalizer import Canonicalizer
 from avatar.canonical.posed import prepare_scan
-from avatar.canonical.rivals import KNN, NearestBody, SkinningSource
 from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import DataError
 from avatar.data.batches import FrameDataset
-from avatar.data.soundness import check_frame_count
-from avatar.data.streaming import Streamed
+from avatar.data.streaming import LruSequence
+from avatar.data.validation import check_frame_count
 from avatar.environment import choose_device, prepared_process
 from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.checkpoints import read_weights, write_weights
@@ -37,12 +37,12 @@ from avatar.training.trainer import Trainer, spent
 from avatar.world import require_single_process
 
 # What makes canonical scans of trained weights, beside this module; how these were trained shows in the weights.
-SOURCE = ("avatar.canonical.scans", "avatar.canonical.rivals", "avatar.methods.canonicalizer", "avatar.data.layouts")
+SOURCE = ("avatar.canonical.scans", "avatar.canonical.baselines", "avatar.methods.canonicalizer", "avatar.data.layouts")
 
 
 @prepared_process()
 def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None = None) -> Path:
-    """Trains a run's canonicalizer, or goes on with it; gives the run's folder. Rivals have nothing to learn.
+    """Trains a run's canonicalizer, or goes on with it; gives the run's folder. Baselines have nothing to learn.
 
     Args:
         config: the run.
@@ -62,7 +62,7 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     names = [frames.names[index].name for index in learned]
     check_frame_count(names, frames.outfits[0].path / "train", "the canonicalizer")
     pool = config.train.draw.pool
-    scans = Streamed(
+    scans = LruSequence(
         lambda place: prepare_scan(frames.frame(learned[place]), template, pool, config.train.seed), len(learned)
     )
     torch.manual_seed(config.train.seed)

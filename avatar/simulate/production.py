@@ -84,10 +84,10 @@ def one_thread() -> Iterator[None]:
 
 def dress(outfit: OutfitConfig, travel: TravelConfig) -> DressedBody:
     """A body in an outfit."""
-    return DressedBody(wearer(outfit.shape), outfit, travel)
+    return DressedBody(subject(outfit.shape), outfit, travel)
 
 
-def wearer(shape: str) -> BodyModel:
+def subject(shape: str) -> BodyModel:
     """The open body in one of its shapes, or a body of its topology from a file of tools/make_body.py.
 
     Raises:
@@ -111,8 +111,8 @@ def write_outfit(dressed: DressedBody, folder: Path, gates: GateConfig) -> None:
     if (folder / "garment.npz").is_file():
         there = read_open_garment(folder / "garment.npz")
         if not np.array_equal(there.faces, dressed.faces):
-            mend = "Choose another root or remove it."
-            raise DataError(folder, "it holds frames of the same outfit cut otherwise.", mend)
+            hint = "Choose another root or remove it."
+            raise DataError(folder, "it holds frames of the same outfit cut otherwise.", hint)
         if (folder / "outfit.yaml").is_file():
             return
     canonical = dressed.settle(np.zeros_like(dressed.start_pose)).cloth

@@ -1,4 +1,4 @@
-"""Scans carried to the canonical pose: positions, normals, cuts; and the rivals' weights."""
+"""Scans unposed to the canonical pose: positions, normals, cuts; and the baselines' weights."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 from limbs import arm_frame, arm_template, true_weights
 
-from avatar.canonical.rivals import KNN, NearestBody
+from avatar.canonical.baselines import KNN, NearestBody
 from avatar.canonical.scans import canonicalize_scan, cut_stretched, edge_stretch
 from avatar.checks import AvatarError
 from avatar.records import Scan

@@ -128,7 +128,7 @@ def test_legs_apart_is_another_canonical_space(copy):
     np.testing.assert_allclose(apart.fit_pose(pose).vertices, straight.vertices, atol=1e-5)
 
 
-def test_a_wearer_may_come_from_a_file(copy, tiny_outfit):
+def test_a_subject_may_come_from_a_file(copy, tiny_outfit):
     """As tools/simulate.py shapes=[tall.npz] leaves it; a body of another topology is refused."""
     text = (copy / "outfit.yaml").read_text()
     (copy / "outfit.yaml").write_text(text.replace("model: open", "model: packed"))

@@ -23,11 +23,11 @@ from avatar.evaluation.canonical_scores import (
 )
 from avatar.evaluation.canonical_truth import (
     Canonicalized,
-    carry_truly,
-    carry_with,
     contact_points,
     frame_truth,
     repose,
+    unpose_truly,
+    unpose_with,
     weights_under,
 )
 from avatar.evaluation.scores import read_scores, write_scores
@@ -85,7 +85,7 @@ def test_true_weights_find_the_true_places_of_what_only_the_bones_move(bind_turn
     template, points = bar(bind_turn), bar_points()
     frame = bent_frame(template, points, weights_under(points, template))
     truth = frame_truth(frame.scan, template)
-    result = carry_truly(frame, truth, template)
+    result = unpose_truly(frame, truth, template)
     np.testing.assert_allclose(result.scan.points, points, atol=1e-5)
     np.testing.assert_allclose(result.scan.normals, np.tile([0, 1, 0], (len(points), 1)), atol=1e-4)
     back = repose(result.scan.points, result.forward_weights, frame.body, template)
@@ -104,7 +104,7 @@ def test_errors_are_those_of_the_weights():
     frame = bent_frame(template, points, weights_under(points, template), angle=1.0)
     truth = frame_truth(frame.scan, template)
     wrong = np.tile(np.float32([1, 0]), (len(points), 1))
-    result = Canonicalized(carry_with(wrong, frame, template), truth.weights)
+    result = Canonicalized(unpose_with(wrong, frame, template), truth.weights)
     seen = CanonicalComparison(frame, truth, result, template)
     far = points[:, 0] > 1.1
     arm = np.linalg.norm(points[far] - [1, 0, 0], axis=1)
@@ -129,7 +129,7 @@ def test_parts_losses_and_cuts_are_of_the_points_kept():
     faces = np.stack([np.arange(19), np.arange(1, 20), np.arange(2, 21)], axis=1)
     frame = replace(frame, scan=replace(frame.scan, faces=faces))
     truth = frame_truth(frame.scan, template)
-    whole = carry_truly(frame, truth, template)
+    whole = unpose_truly(frame, truth, template)
     kept = np.arange(5, 21)
     moved = whole.scan.points[kept] + np.float32([0, 0.03, 0]) * (labels[kept] == 0)[:, None]
     scan = replace(
@@ -154,7 +154,7 @@ def test_distance_to_the_surface_needs_no_correspondence():
     template, points = bar(), bar_points()
     frame = bent_frame(template, points, weights_under(points, template))
     truth = frame_truth(frame.scan, template)
-    result = carry_truly(frame, truth, template)
+    result = unpose_truly(frame, truth, template)
     slid = replace(result.scan, points=result.scan.points + np.float32([0.1, 0.02, 0]))
     corners = np.array([[-1.0, 0.05, -1], [4, 0.05, -1], [4, 0.05, 1], [-1, 0.05, 1]])
     plane = Mesh(corners, np.array([[0, 2, 1], [0, 3, 2]]))
@@ -179,7 +179,7 @@ def test_scans_of_another_frame_and_data_without_truth_are_refused():
     template, points = bar(), bar_points()
     frame = bent_frame(template, points, weights_under(points, template))
     truth = frame_truth(frame.scan, template)
-    result = carry_truly(frame, truth, template)
+    result = unpose_truly(frame, truth, template)
     other = replace(result.scan, source=result.scan.source + 1)
     with pytest.raises(AvatarError, match=r"indices below the scan.s 21 points, got 21 up to 21\..*same scanner"):
         CanonicalComparison(frame, truth, Canonicalized(other), template)
@@ -239,7 +239,7 @@ def scored(tiny_folder):
     best = BestSkinning(outfit, "train", outfit.frames("train"))
 
     def lifted(frame):
-        result = carry_truly(frame, frame_truth(frame.scan, outfit.template), outfit.template)
+        result = unpose_truly(frame, frame_truth(frame.scan, outfit.template), outfit.template)
         return replace(result, scan=replace(result.scan, points=result.scan.points + np.float32([0, 0.1, 0])))
 
     label = Label("lifted", table="t1", variant="x", seed=3, steps=7, commit="abc")
@@ -269,7 +269,7 @@ def test_true_weights_stand_beside_methods_of_one_variant(tiny_folder):
     outfit = OpenOutfit(tiny_folder, "open", ScanConfig(points=300))
 
     def truly(frame):
-        return carry_truly(frame, frame_truth(frame.scan, outfit.template), outfit.template)
+        return unpose_truly(frame, frame_truth(frame.scan, outfit.template), outfit.template)
 
     rows = []
     for split in ("train", "test"):
@@ -334,7 +334,7 @@ def test_best_weights_are_found_at_places_of_the_same_label(tiny_outfit):
 
 def test_errors_name_the_frame(tiny_outfit):
     def wrong(frame):
-        result = carry_truly(frame, frame_truth(frame.scan, tiny_outfit.template), tiny_outfit.template)
+        result = unpose_truly(frame, frame_truth(frame.scan, tiny_outfit.template), tiny_outfit.template)
         return replace(result, scan=replace(result.scan, source=result.scan.source + 9999))
 
     with pytest.raises(AvatarError, match=r"outfit tiny, frame rise\.00001: source"):

@@ -7,13 +7,13 @@ import torch
 from reference import chamfer_loop
 
 from avatar.checks import AvatarError
-from avatar.geometry.bags import gather_rows
 from avatar.geometry.distances import (
     correspond,
     normal_difference,
     point_to_plane,
     point_to_point,
 )
+from avatar.geometry.sparse import gather_rows
 from avatar.geometry.transforms import rotation_from_axis_angle
 
 

@@ -227,8 +227,8 @@ def test_a_skirt_is_learned_better_than_the_nearest_leg_says_and_an_unseen_one_f
 
     def nearest(frame, scan):
         trees = (scan.body, template.vertices)
-        rivals = (lambda p, body=body: template.weights[torch.cdist(p, body).argmin(1)] for body in trees)
-        return errors(frame, scan, *rivals)
+        baselines = (lambda p, body=body: template.weights[torch.cdist(p, body).argmin(1)] for body in trees)
+        return errors(frame, scan, *baselines)
 
     ours = np.mean([learned(frame, scan, code) for frame, scan, code in zip(frames, scans, model.codes)], axis=0)
     theirs = np.mean([nearest(frame, scan) for frame, scan in zip(frames, scans)], axis=0)
@@ -382,7 +382,7 @@ def test_canonical_scores_are_measured_again_when_their_code_or_the_scans_change
         found.append({(row.method, row.variant): row.value for row in rows})
         return len(measured)
 
-    assert [count(1), count(1)] == [6, 0]  # two splits of a frame, two rivals and the true weights
+    assert [count(1), count(1)] == [6, 0]  # two splits of a frame, two baselines and the true weights
     change_source("avatar.evaluation.canonical_scores")
     assert [count(2), count(2)] == [6, 0]
     assert found[0] == found[1] != found[2] == {method: 2 * value for method, value in found[0].items()}

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from spheres import TEMPLATE, random_batch, small_config
-from wearers import BodyField, SmoothField, posed_batch, vertex_samples
+from subjects import BodyField, SmoothField, posed_batch, vertex_samples
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
@@ -280,7 +280,7 @@ def test_half_precision_ends_before_posing(skinning):
     model = by_body if skinning == "body" else dressed(body, [SmoothField(22)], **scale)
     with torch.autocast("cpu", torch.bfloat16):
         prediction = model(batch, samples)
-    again = model.carry(Decoded(prediction.offsets, prediction.offsets), batch, samples)
+    again = model.pose_points(Decoded(prediction.offsets, prediction.offsets), batch, samples)
     torch.testing.assert_close(prediction.points, again.offsets, atol=1e-6, rtol=0)
 
 

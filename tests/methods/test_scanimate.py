@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from avatar.canonical.rivals import NearestBody
+from avatar.canonical.baselines import NearestBody
 from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError, DataError
 from avatar.data.canonical_batches import CanonicalFrames, canonical_frame

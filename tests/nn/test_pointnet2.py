@@ -82,7 +82,7 @@ def test_interpolation_returns_coarse_values_at_coarse_points():
     level = build_levels(sphere_template().vertices.double(), SIZES)[0]
     coarse = torch.randn(1, 40, 4, dtype=torch.float64)
     shared = (level.finer_positions[:, None] - level.positions[None]).norm(dim=-1).min(dim=0).indices
-    torch.testing.assert_close(level.spread(coarse)[:, shared], coarse, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(level.interpolate_up(coarse)[:, shared], coarse, rtol=1e-5, atol=1e-5)
 
 
 def test_encoder_goes_down_and_up_with_each_level_s_own_features_joined():

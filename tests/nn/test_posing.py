@@ -1,10 +1,10 @@
-"""Learned skinning: the body's own where the field is the body's, each wearer's own, differentiable in the points."""
+"""Learned skinning: the body's own where the field is the body's, each subject's own, differentiable in the points."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from wearers import BodyField, SmoothField, posed_batch, vertex_samples
+from subjects import BodyField, SmoothField, posed_batch, vertex_samples
 
 from avatar.body.open import open_body
 from avatar.body.registry import canonical_pose
@@ -20,7 +20,7 @@ def posed(skinning: LearnedSkinning, points: torch.Tensor, batch) -> torch.Tenso
 
 
 @pytest.mark.parametrize("canonical", ["t", "apart"])
-def test_the_bodys_weights_give_the_posed_body_of_each_wearer(canonical):
+def test_the_bodys_weights_give_the_posed_body_of_each_subject(canonical):
     names = open_body("female").joint_names
     bodies = [open_body(shape).with_canonical_pose(canonical_pose(canonical, names)) for shape in ("female", "male")]
     templates = [body.template for body in bodies]

@@ -128,7 +128,7 @@ def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_pos
     assert error(fitted, fitted.model.codes[0].detach()) < 0.7 * min(tight, start)
 
 
-def test_another_wearer_s_field_is_not_fitted():
+def test_another_subject_s_field_is_not_fitted():
     model = ClosetAvatar(TEMPLATE, 1, small_config(skinning=Skinning.learned))
     with pytest.raises(AvatarError, match="skinning=body"):
         Closet().fit_code(trained(model), random_batch(1), FitConfig())

@@ -17,7 +17,7 @@ from avatar.simulate.dressing import Rest, bind_pose, pose_path
 from avatar.simulate.gates import GateConfig, edge_stretch, frame_names, missed, record_frame
 from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.poses import NamedPose
-from avatar.simulate.production import FrameLedger, is_sound, wearer
+from avatar.simulate.production import FrameLedger, is_sound, subject
 from avatar.simulate.recording import (
     PRESETS,
     SimulateConfig,
@@ -65,12 +65,12 @@ def test_folders_tell_bodies_apart(tmp_path):
 
 def test_bodies_from_files_are_of_the_open_topology(tmp_path):
     write_body(tmp_path / "tall.npz", open_body("male"))
-    found = wearer(str(tmp_path / "tall.npz")).template
+    found = subject(str(tmp_path / "tall.npz")).template
     torch.testing.assert_close(found.vertices, open_body("male").template.vertices, atol=1e-6, rtol=0)
     few = open_body("male").template
     write_template(tmp_path / "cut.npz", replace(few, faces=few.faces[:-1], uv=None, uv_faces=None))
     with pytest.raises(DataError, match="make_body"):
-        wearer(str(tmp_path / "cut.npz"))
+        subject(str(tmp_path / "cut.npz"))
 
 
 def test_settled_poses_follow_preset_and_overrides():

@@ -32,7 +32,7 @@ class LatePropagation(FeaturePropagation):
     """Feature propagation that interpolates first and joins before the first layer."""
 
     def forward(self, coarse: Tensor, fine: Tensor) -> Tensor:
-        return self.mlp(torch.cat([self.level.spread(coarse), fine], dim=-1))
+        return self.mlp(torch.cat([self.level.interpolate_up(coarse), fine], dim=-1))
 
 
 class IndexedGroups(torch.nn.Module):
@@ -66,7 +66,7 @@ def slow_gathers(encoder: PointNet2) -> PointNet2:
     for layer in slow.abstractions:
         layer.level.group = IndexedGroups(layer.level, up=False)
     for layer in slow.propagations:
-        layer.level.spread = IndexedGroups(layer.level, up=True)
+        layer.level.interpolate_up = IndexedGroups(layer.level, up=True)
     return slow
 
 

@@ -1,7 +1,7 @@
 """Checks of bodies, poses and frames when they are loaded, so that bad data never trains.
 
 Units, axes, overlap of scan and body, normals, poses written another way. What is refused is refused with what was
-seen and the likely mend; these are the mistakes that users of the published codes report most.
+seen and the likely correction; these are the mistakes that users of the published codes report most.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.checks import AvatarError, DataError, check_finite
-from avatar.data.alignment import NEAR, Overlap, measure_overlap, suggest_mend
+from avatar.data.alignment import NEAR, Overlap, measure_overlap, suggest_hint
 from avatar.records import Frame, Scan, Template
 
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
@@ -29,7 +29,7 @@ AXES = (  # two joints, where the second lies from the first
     ("pelvis", "neck", "+y"),
     ("right_hip", "left_hip", "+x"),
 )
-TURNS = {  # where it should lie and where it does: what mends it
+TURNS = {  # where it should lie and where it does: what corrects it
     ("+y", "-y"): "Turn body and scans by 180 degrees about z: (x, y, z) to (-x, -y, z).",
     ("+y", "+z"): "Turn body and scans by -90 degrees about x: (x, y, z) to (x, z, -y).",
     ("+y", "-z"): "Turn body and scans by 90 degrees about x: (x, y, z) to (x, -z, y).",
@@ -45,7 +45,7 @@ def check_template(template: Template, path: Path) -> None:
     """Refuses a body at rest that does not stand upright in metres, y up, facing +z.
 
     Raises:
-        DataError: with the turn, or the factor, that would mend it.
+        DataError: with the turn, or the factor, that would correct it.
     """
     vertices = template.vertices.numpy()
     extents = np.ptp(vertices, axis=0)
@@ -61,7 +61,7 @@ def check_frame(frame: Frame, template: Template, path: Path) -> None:
     """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out.
 
     Raises:
-        DataError: naming the file, what was expected and how to mend it.
+        DataError: naming the file, what was expected and how to correct it.
     """
     points, body = frame.scan.points, frame.body.vertices
     if len(points) < FEWEST_POINTS:
@@ -133,8 +133,8 @@ def _check_axes(template: Template, path: Path) -> None:
     for start, end, wanted in AXES:
         if start in places and end in places and (found := _axis_along(places[end] - places[start])) != wanted:
             problem = f"joints: expected {end} towards {wanted} from {start}, it lies towards {found or 'no axis'}."
-            mend = TURNS.get((wanted, found), "Turn body and scans so that y is up and the body faces +z.")
-            raise DataError(path, problem, mend)
+            hint = TURNS.get((wanted, found), "Turn body and scans so that y is up and the body faces +z.")
+            raise DataError(path, problem, hint)
     _, height, depth = np.ptp(template.vertices.numpy(), axis=0)
     if height < depth / 2:
         problem = f"vertices: expected a body that stands along y, it is {height:.2f} m high and {depth:.2f} m deep."
@@ -162,10 +162,10 @@ def _check_overlap(overlap: Overlap, scan: Scan, body: np.ndarray, faces: np.nda
     )
     shift = np.median(body, axis=0) - np.median(scan.points, axis=0)
     if np.abs(shift).max() > FAR_OFF:
-        mend = f"Their middles differ by ({', '.join(f'{s:.1f}' for s in shift)}) m: is the translation in metres?"
+        hint = f"Their middles differ by ({', '.join(f'{s:.1f}' for s in shift)}) m: is the translation in metres?"
     else:
-        mend = suggest_mend(scan.points, scan.normals, body, faces)
-    raise DataError(path, problem, mend)
+        hint = suggest_hint(scan.points, scan.normals, body, faces)
+    raise DataError(path, problem, hint)
 
 
 def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> None:

@@ -1,18 +1,18 @@
-"""Bags of rows against the loop they stand for, their transpose against the matrix's, gradients of both orders."""
+"""Sparse sums of rows against the loop they stand for, their transpose against the matrix, gradients of both orders."""
 
 import pretended
 import pytest
 import torch
 
 from avatar.checks import AvatarError
-from avatar.geometry.bags import Bags, gather_rows, pick, sum_bags
+from avatar.geometry.sparse import SparseRows, gather_rows, gather_sum, pick
 
 SOURCE = torch.Generator().manual_seed(0)
 TABLE = torch.randint(0, 9, (20, 3), generator=SOURCE)  # of 12 rows, so that three are in no bag
 WEIGHTS = torch.rand(20, 3, dtype=torch.float64, generator=SOURCE)
 
 
-def as_matrix(bags: Bags) -> torch.Tensor:
+def as_matrix(bags: SparseRows) -> torch.Tensor:
     """The map as a dense matrix ``(R, V)``, entry by entry."""
     matrix = torch.zeros(len(bags.starts), bags.rows, dtype=torch.float64)
     ends = [*bags.starts[1:].tolist(), len(bags.ids)]
@@ -24,28 +24,28 @@ def as_matrix(bags: Bags) -> torch.Tensor:
 
 @pytest.mark.parametrize("weights", [None, WEIGHTS])
 def test_sums_and_their_transpose_agree_with_the_matrix(weights):
-    bags = Bags.of_table(TABLE, 12, weights)
+    bags = SparseRows.of_table(TABLE, 12, weights)
     matrix = as_matrix(bags)
     values = torch.randn(2, 4, 12, 5, dtype=torch.float64, generator=SOURCE)
-    torch.testing.assert_close(sum_bags(values, bags), matrix @ values)
+    torch.testing.assert_close(gather_sum(values, bags), matrix @ values)
     torch.testing.assert_close(as_matrix(bags.transpose()), matrix.T)
     torch.testing.assert_close(as_matrix(bags.transpose().transpose()), matrix)
 
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_gradients_of_both_orders(kept):
-    bags = Bags.of_table(TABLE[:6], 12, WEIGHTS[:6])
+    bags = SparseRows.of_table(TABLE[:6], 12, WEIGHTS[:6])
     back = bags.transpose() if kept else None
     values = torch.randn(2, 12, 2, dtype=torch.float64, generator=SOURCE, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda v: sum_bags(v, bags, back), values)
-    assert torch.autograd.gradgradcheck(lambda v: sum_bags(v, bags, back).sin(), values)
+    assert torch.autograd.gradcheck(lambda v: gather_sum(v, bags, back), values)
+    assert torch.autograd.gradgradcheck(lambda v: gather_sum(v, bags, back).sin(), values)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.bfloat16, 2e-2)])
 def test_narrow_types_keep_their_type_and_agree_to_rounding(dtype, tolerance):
-    bags = Bags.of_table(TABLE, 12, WEIGHTS)
+    bags = SparseRows.of_table(TABLE, 12, WEIGHTS)
     values = torch.rand(1, 12, 8, dtype=torch.float64, generator=SOURCE)
-    found = sum_bags(values.to(dtype), bags)
+    found = gather_sum(values.to(dtype), bags)
     assert found.dtype == dtype
     torch.testing.assert_close(found.double(), as_matrix(bags) @ values, rtol=tolerance, atol=tolerance)
 
@@ -57,14 +57,14 @@ def test_gradients_do_not_depend_on_the_number_of_threads():
     threads, found = torch.get_num_threads(), []
     for count in (1, 2):
         torch.set_num_threads(count)
-        found += torch.autograd.grad(sum_bags(values, Bags.of_table(table, 50)), values, gradient)
+        found += torch.autograd.grad(gather_sum(values, SparseRows.of_table(table, 50)), values, gradient)
     torch.set_num_threads(threads)
     assert torch.equal(*found)
 
 
 def test_values_of_another_number_of_rows_are_refused():
     with pytest.raises(AvatarError, match="V=12"):
-        sum_bags(torch.zeros(11, 3), Bags.of_table(TABLE, 12))
+        gather_sum(torch.zeros(11, 3), SparseRows.of_table(TABLE, 12))
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param(pretended.NAME, marks=pytest.mark.pretended)])

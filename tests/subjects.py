@@ -38,7 +38,7 @@ def vertex_samples(ids: Tensor) -> SurfaceSamples:
 
 
 def posed_batch(bodies: list[BodyModel], outfit_ids: list[int], seed: int = 0) -> Batch:
-    """Frames of several wearers in random poses, turned and moved in the world."""
+    """Frames of several subjects in random poses, turned and moved in the world."""
     draw = torch.Generator().manual_seed(seed)
     poses = 0.5 * torch.randn(len(outfit_ids), 1, 22, 3, generator=draw)
     moves = torch.randn(len(outfit_ids), 1, 3, generator=draw)

@@ -18,10 +18,10 @@ from avatar.checks import check_shape
 
 
 @dataclass(frozen=True)
-class Bags:
+class SparseRows:
     """A sparse linear map on rows: result ``i`` adds up ``weights[j] * values[ids[j]]`` for j from ``starts[i]`` on.
 
-    ``ids (L,)`` int64, ``starts (R,)`` int64, one bag after the other, ``weights (L,)`` or None where all are one;
+    ``ids (L,)`` int64, ``starts (R,)`` int64, one sum after the other, ``weights (L,)`` or None where all are one;
     ``rows`` is the number of rows of the values.
     """
 
@@ -31,8 +31,8 @@ class Bags:
     rows: int
 
     @classmethod
-    def of_table(cls, ids: Tensor, rows: int, weights: Tensor | None = None) -> Bags:
-        """Bags of one size: ``ids (R, K)`` and weights alike."""
+    def of_table(cls, ids: Tensor, rows: int, weights: Tensor | None = None) -> SparseRows:
+        """SparseRows of one size: ``ids (R, K)`` and weights alike."""
         dims = check_shape("ids", ids, "R K")
         if weights is not None:
             check_shape("weights", weights, "R K", **dims)
@@ -40,49 +40,49 @@ class Bags:
         starts = torch.arange(0, ids.numel(), dims["K"], device=ids.device)
         return cls(ids.flatten(), starts, weights, rows)
 
-    def transpose(self) -> Bags:
+    def transpose(self) -> SparseRows:
         """The transposed map: it takes a row for every bag and has a bag for every row."""
         order = self.ids.argsort(stable=True)
         places = torch.arange(self.rows, device=order.device)
         members = torch.searchsorted(self.starts, order, right=True) - 1
         weights = None if self.weights is None else self.weights[order]
-        return Bags(members, torch.searchsorted(self.ids[order], places), weights, len(self.starts))
+        return SparseRows(members, torch.searchsorted(self.ids[order], places), weights, len(self.starts))
 
 
-class _SumBags(torch.autograd.Function):
+class _GatherSum(torch.autograd.Function):
     """The sum with its transpose as backward pass; differentiable as often as one likes."""
 
     @staticmethod
-    def forward(context: Any, values: Tensor, bags: Bags, back: Bags | None) -> Tensor:
-        context.bags, context.back = bags, back
+    def forward(context: Any, values: Tensor, sparse: SparseRows, back: SparseRows | None) -> Tensor:
+        context.sparse, context.back = sparse, back
         frames, rows, channels = values.shape
         each = torch.arange(frames, device=values.device)[:, None]
-        weights = None if bags.weights is None else bags.weights.to(values.dtype).repeat(frames)
+        weights = None if sparse.weights is None else sparse.weights.to(values.dtype).repeat(frames)
         summed = embedding_bag(
-            (bags.ids + each * rows).flatten(),
+            (sparse.ids + each * rows).flatten(),
             values.reshape(-1, channels),
-            (bags.starts + each * len(bags.ids)).flatten(),
+            (sparse.starts + each * len(sparse.ids)).flatten(),
             mode="sum",
             per_sample_weights=weights,
         )
-        return summed.view(frames, len(bags.starts), channels)
+        return summed.view(frames, len(sparse.starts), channels)
 
     @staticmethod
     def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
-        back = context.back or context.bags.transpose()
-        return _SumBags.apply(gradient, back, context.bags), None, None
+        back = context.back or context.sparse.transpose()
+        return _GatherSum.apply(gradient, back, context.sparse), None, None
 
 
-def sum_bags(values: Tensor, bags: Bags, back: Bags | None = None) -> Tensor:
-    """Sums of bags of rows, ``(..., V, C)`` to ``(..., R, C)``; differentiable in the values.
+def gather_sum(values: Tensor, sparse: SparseRows, back: SparseRows | None = None) -> Tensor:
+    """Sums of sparse of rows, ``(..., V, C)`` to ``(..., R, C)``; differentiable in the values.
 
     Args:
         values: any number of arrays of rows.
-        bags: which rows, with which weights.
-        back: ``bags.transpose()``, where it is at hand; else the backward pass makes it.
+        sparse: which rows, with which weights.
+        back: ``sparse.transpose()``, where it is at hand; else the backward pass makes it.
     """
-    check_shape("values", values, "... V C", V=bags.rows)
-    summed = _SumBags.apply(values.reshape(-1, *values.shape[-2:]), bags, back)
+    check_shape("values", values, "... V C", V=sparse.rows)
+    summed = _GatherSum.apply(values.reshape(-1, *values.shape[-2:]), sparse, back)
     return summed.view(*values.shape[:-2], *summed.shape[-2:])
 
 
@@ -92,8 +92,8 @@ def pick(values: Tensor, ids: Tensor) -> Tensor:
     The backward pass of ``values[ids]`` itself adds in an order of chance where an entry is picked more than once.
     """
     check_shape("ids", ids, "N")
-    bags = Bags.of_table(ids[:, None], len(values))
-    return sum_bags(values.reshape(len(values), -1), bags).view(len(ids), *values.shape[1:])
+    sparse = SparseRows.of_table(ids[:, None], len(values))
+    return gather_sum(values.reshape(len(values), -1), sparse).view(len(ids), *values.shape[1:])
 
 
 class _GatherRows(torch.autograd.Function):
@@ -112,8 +112,8 @@ class _GatherRows(torch.autograd.Function):
             zeros = gradient.new_zeros(frames, rows, channels)
             return zeros.scatter_add(1, ids.unsqueeze(-1).expand_as(gradient), gradient), None
         each = rows * torch.arange(frames, device=ids.device)[:, None]
-        back = Bags.of_table((ids + each).reshape(-1, 1), frames * rows).transpose()
-        return sum_bags(gradient.reshape(-1, channels), back).view(frames, rows, channels), None
+        back = SparseRows.of_table((ids + each).reshape(-1, 1), frames * rows).transpose()
+        return gather_sum(gradient.reshape(-1, channels), back).view(frames, rows, channels), None
 
 
 def gather_rows(values: Tensor, ids: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Refusals: every mistake users make with their own scans is named, with what would mend it; sound data passes."""
+"""Refusals: every mistake users make with their own scans is named, with what would hint it; sound data passes."""
 
 import dataclasses
 import time
@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError
-from avatar.data.alignment import measure_overlap, suggest_mend
+from avatar.data.alignment import measure_overlap, suggest_hint
 from avatar.data.layouts import find_outfit
 from avatar.data.scanner import SCANNERS
-from avatar.data.soundness import check_frame, check_frame_count, check_pose, check_template
+from avatar.data.validation import check_frame, check_frame_count, check_pose, check_template
 from avatar.geometry.surface import vertex_normals
 from avatar.records import BodyFit, Frame, Scan
 
@@ -131,11 +131,11 @@ def test_a_scan_too_deep_in_its_body_or_of_too_little_of_it_is_refused(tmp_path)
 def test_the_mend_that_is_named_mends(tmp_path):
     frame = turned(person(lopsided()), turn_about("x", 90), (0, 1.0, 0.5))
     points, body, faces = frame.scan.points, frame.body.vertices, BODY.template.faces.numpy()
-    words = suggest_mend(points, frame.scan.normals, body, faces)
+    words = suggest_hint(points, frame.scan.normals, body, faces)
     shift = np.array([float(number) for number in words.split("(")[1].split(")")[0].split(",")])
-    mended = points @ turn_about("x", -90).T + shift
+    moved = points @ turn_about("x", -90).T + shift
     normals = frame.scan.normals @ turn_about("x", -90).T
-    assert measure_overlap(mended, normals, body, faces).covered > 0.95
+    assert measure_overlap(moved, normals, body, faces).covered > 0.95
 
 
 def test_the_fit_of_another_frame_is_refused(tmp_path):
@@ -246,12 +246,12 @@ def test_the_turns_that_are_named_for_a_template_mend_it(tmp_path):
         with pytest.raises(DataError) as caught:
             check_template(template, tmp_path)
         entries = str(caught.value).rpartition(" to (")[2].partition(")")[0].split(", ")
-        mend = torch.zeros(3, 3)
+        hint = torch.zeros(3, 3)
         for row, entry in enumerate(entries):
-            mend[row, "xyz".index(entry[-1])] = -1 if entry.startswith("-") else 1
-        mended = dataclasses.replace(template, vertices=template.vertices @ mend.T, joints=template.joints @ mend.T)
-        check_template(mended, tmp_path)
-        torch.testing.assert_close(mended.vertices, BODY.template.vertices, atol=1e-5, rtol=0)
+            hint[row, "xyz".index(entry[-1])] = -1 if entry.startswith("-") else 1
+        moved = dataclasses.replace(template, vertices=template.vertices @ hint.T, joints=template.joints @ hint.T)
+        check_template(moved, tmp_path)
+        torch.testing.assert_close(moved.vertices, BODY.template.vertices, atol=1e-5, rtol=0)
 
 
 def test_a_template_without_known_joints_is_judged_by_its_shape(tmp_path):
