@@ -179,8 +179,8 @@ def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start:
     return code.detach()
 
 
-class Skinning(Enum):
-    """Whose skinning weights carry a scan to the canonical pose."""
+class WeightSource(Enum):
+    """Source of the skinning weights that unpose a scan."""
 
     learned = "learned"
     nearest = "nearest"  # the nearest body vertex's
@@ -196,7 +196,7 @@ class CanonicalizeConfig:
     name: str = "default"
     data_root: Path = Path("data")
     runs_root: Path = Path("runs")
-    weights: Skinning = Skinning.learned
+    weights: WeightSource = WeightSource.learned
     scan: ScanConfig = field(default_factory=lambda: replace(SCANNERS["raw_mesh"]))
     split: SplitConfig = field(default_factory=lambda: SplitConfig(validation_share=0.0))
     canonicalizer: CanonicalizerConfig = field(default_factory=CanonicalizerConfig)
@@ -250,7 +250,7 @@ class TrainedCanonicalizer:
 
     @property
     def forward_field(self) -> SkinningField:
-        """Skinning weights of canonical space: frozen, differentiable in the points."""
+        """WeightSource weights of canonical space: frozen, differentiable in the points."""
         return copy.deepcopy(self.model.forward_field).eval().requires_grad_(False)
 
     def code_of(self, frame: Frame) -> Tensor:

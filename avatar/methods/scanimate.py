@@ -28,7 +28,7 @@ from avatar.io.documents import read_yaml
 from avatar.methods.base import CANONICALIZER, Inputs, Method, Position, Stage, Task, TrainedAvatar
 from avatar.methods.canonicalizer import (
     CanonicalizeConfig,
-    Skinning,
+    WeightSource,
     canonical_outfits,
     canonicalizer_folder,
     load_canonicalizer,
@@ -227,7 +227,7 @@ def find_field(folder: Path, template: Template) -> nn.Module:
     path = folder / "config.yaml"
     if not path.is_file():
         raise DataError(path, "no such file.", "Run tools/canonicalize.py to its end.")
-    if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is Skinning.learned:
+    if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is WeightSource.learned:
         return load_canonicalizer(folder, "cpu").forward_field
     return BodyField(template)
 

@@ -26,7 +26,7 @@ from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, module_digest
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole
-from avatar.methods.canonicalizer import CanonicalizeConfig, Skinning, TrainedCanonicalizer
+from avatar.methods.canonicalizer import CanonicalizeConfig, TrainedCanonicalizer, WeightSource
 from avatar.pipeline.scores import current_commit
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
@@ -81,7 +81,7 @@ def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> S
         AvatarError: for data that were not simulated: nobody knows their canonical places.
     """
     outfit, scores, tables = frames.outfits[0], Scores(), []
-    kinds = dict.fromkeys((config.weights, Skinning.knn, Skinning.nearest))
+    kinds = dict.fromkeys((config.weights, WeightSource.knn, WeightSource.nearest))
     with lock_folder(config.folder, wait=True):
         ledger = Ledger(config.folder)
         for split in dict.fromkeys(where.split for where in frames.names):
@@ -163,7 +163,7 @@ def draw_surface(
 
 
 def weight_colors(weights: np.ndarray) -> np.ndarray:
-    """Skinning weights ``(M, J)`` as colours ``(M, 3)``: each joint has its own, neighbours in number far apart."""
+    """WeightSource weights ``(M, J)`` as colours ``(M, 3)``: each joint has its own, neighbours in number far apart."""
     hues = (np.arange(weights.shape[1]) * 0.381966) % 1  # the golden section spreads them
     palette = np.array([colorsys.hsv_to_rgb(hue, 0.75, 0.95) for hue in hues])
     return np.clip(weights @ palette, 0, 1)

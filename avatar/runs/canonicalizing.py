@@ -26,7 +26,7 @@ from avatar.methods.canonicalizer import (
     WEIGHTS,
     CanonicalizeConfig,
     CanonicalizerTask,
-    Skinning,
+    WeightSource,
     load_canonicalizer,
 )
 from avatar.progress import tracked
@@ -56,7 +56,7 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     template = frames.outfits[0].template
     save_settings(config)
     write_template(config.folder / "template.npz", template)
-    if config.weights is not Skinning.learned or is_trained(config):
+    if config.weights is not WeightSource.learned or is_trained(config):
         return config.folder
     learned = [index for index, where in enumerate(frames.names) if where.split == "train"]
     names = [frames.names[index].name for index in learned]
@@ -117,16 +117,16 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
 
 def skinning_source(config: CanonicalizeConfig, template: Template) -> SkinningSource:
     """What gives a run's scans their weights: its trained canonicalizer, or the body nearby."""
-    if config.weights is Skinning.learned:
+    if config.weights is WeightSource.learned:
         return load_canonicalizer(config.folder, config.device)
-    return NearestBody(template, KNN if config.weights is Skinning.knn else 1)
+    return NearestBody(template, KNN if config.weights is WeightSource.knn else 1)
 
 
 def scans_digest(config: CanonicalizeConfig) -> str:
     """One hash over all that a run's canonical scans depend on but the data: weights, scanner, cut and code."""
     plain = settings_to_dict(config)
     parts = {key: plain[key] for key in ("weights", "scan", "stretch")}
-    if config.weights is Skinning.learned:
+    if config.weights is WeightSource.learned:
         parts["learned"] = file_digest(config.folder / f"{WEIGHTS}.safetensors")
     return keyed(SOURCE, program=module_digest(__name__), **parts)
 

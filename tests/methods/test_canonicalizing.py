@@ -30,7 +30,7 @@ from avatar.methods.canonicalizer import (
     CanonicalizeConfig,
     CanonicalizerTask,
     CycleConfig,
-    Skinning,
+    WeightSource,
     fit_latent,
     load_canonicalizer,
     rate_factor,
@@ -328,13 +328,13 @@ def test_frames_without_a_pose_and_meshes_are_canonicalized_the_same(settings, f
     poseless = replace(frame, body=replace(frame.body, pose=None, vertex_transforms=None, pose_vertices=None))
     points = frame.scan.points[::50]
     assert np.array_equal(trained.weights_of(points, poseless), trained.weights_of(points, frame))
-    meshes = replace(settings, scan=ScanConfig(mesh=True, edge=0.05), weights=Skinning.nearest, name="mesh")
+    meshes = replace(settings, scan=ScanConfig(mesh=True, edge=0.05), weights=WeightSource.nearest, name="mesh")
     path = canonicalize_frames(replace(meshes, pictures=0))[0]
     scan = read_canonical_scan(path)
     assert scan.faces is not None and len(read_mesh(path.with_suffix(".ply")).faces) == len(scan.faces)
 
 
-@pytest.mark.parametrize("kind", [Skinning.nearest, Skinning.knn])
+@pytest.mark.parametrize("kind", [WeightSource.nearest, WeightSource.knn])
 def test_rivals_have_nothing_to_learn_and_no_field(settings, kind):
     config = replace(settings, weights=kind, name=kind.value, pictures=0)
     run = canonicalize(config)
@@ -356,7 +356,7 @@ def test_a_run_is_scored_against_the_truth_beside_its_rivals(settings, folder):
     scores = read_scores(folder / "scores.csv")
     values = {(row.method, row.variant, row.metric): row.value for row in scores.rows}
     assert {(method, split) for method, split, _ in values} >= {
-        (kind.value, split) for kind in Skinning for split in ("train", "test")
+        (kind.value, split) for kind in WeightSource for split in ("train", "test")
     }
     assert all(len({f.frame for f in scores.frames if f.variant == split}) == 2 for split in ("train", "test"))
     assert values["nearest", "train", "cycle_cm"] != values["learned", "train", "cycle_cm"]
@@ -370,7 +370,7 @@ def test_canonical_scores_are_measured_again_when_their_code_or_the_scans_change
     settings, monkeypatch, change_source
 ):
     """As `experiment` asks for them, again and again; a fixed metric must not keep its old numbers."""
-    config, measured, found = replace(settings, weights=Skinning.knn, name="scored", pictures=0, scored=1), [], []
+    config, measured, found = replace(settings, weights=WeightSource.knn, name="scored", pictures=0, scored=1), [], []
     frames, real = config.frames(), CANONICAL_METRICS["truth_cm"].measure
 
     def count(factor: float) -> int:

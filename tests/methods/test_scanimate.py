@@ -18,7 +18,7 @@ from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.checkpoints import load_checkpoint
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
-from avatar.methods.canonicalizer import CanonicalizeConfig, Skinning
+from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
 from avatar.methods.scanimate import ImplicitTask, ImplicitTrainConfig
 from avatar.methods.settings import MethodChoice, Precision, RunConfig, Schedule, TrainConfig
 from avatar.records import Scan
@@ -58,7 +58,7 @@ def settings(tiny_folder, tiny_outfit, tmp_path_factory) -> RunConfig:
     """
     runs = tmp_path_factory.mktemp("runs")
     where = {"dataset": tiny_folder.parent.name, "data_root": tiny_folder.parents[1], "runs_root": runs}
-    folder = train_canonicalizer(CanonicalizeConfig(outfit=tiny_folder.name, weights=Skinning.knn, **where))
+    folder = train_canonicalizer(CanonicalizeConfig(outfit=tiny_folder.name, weights=WeightSource.knn, **where))
     source = NearestBody(tiny_outfit.template, 6)
     for name in tiny_outfit.frames("train"):
         frame = tiny_outfit.load("train", name)

@@ -20,7 +20,7 @@ from avatar.evaluation.forms import Axis, FormConfig, ReportedTable
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.methods.canonicalizer import CanonicalizeConfig, Skinning
+from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
 from avatar.methods.settings import MethodChoice
 from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.experiments import ExperimentConfig, experiment, tabulate_experiment
@@ -150,7 +150,7 @@ def test_two_trainings_that_nothing_tells_apart_are_refused(jobs, tmp_path):
 
 @pytest.mark.slow
 def test_a_method_that_takes_a_canonicalizer_gets_it_made_and_scored(first, tiny_outfit, tmp_path):
-    canonicalizer = CanonicalizeConfig(weights=Skinning.knn, scan=ScanConfig(points=2000), scored=1)
+    canonicalizer = CanonicalizeConfig(weights=WeightSource.knn, scan=ScanConfig(points=2000), scored=1)
     job = replace(
         first,
         method=MethodChoice("scanimate", "scanimate", IMPLICIT),

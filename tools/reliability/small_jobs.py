@@ -16,7 +16,7 @@ from avatar.data.outfits import SAMPLE_FOLDER
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
 from avatar.io.frames import write_manifest
-from avatar.methods.canonicalizer import CanonicalizeConfig, CycleConfig, Skinning
+from avatar.methods.canonicalizer import CanonicalizeConfig, CycleConfig, WeightSource
 from avatar.methods.settings import MethodChoice, RunConfig, TrainConfig
 from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
 from avatar.runs.training import train
@@ -68,7 +68,9 @@ def write_data(root: Path) -> Path:
     return folder
 
 
-def canonicalizer_config(root: Path, name: str = "default", weights: Skinning = Skinning.learned) -> CanonicalizeConfig:
+def canonicalizer_config(
+    root: Path, name: str = "default", weights: WeightSource = WeightSource.learned
+) -> CanonicalizeConfig:
     """A canonicalizer of two stages."""
     field = SkinningFieldConfig(width=8)
     return CanonicalizeConfig(
@@ -116,7 +118,7 @@ def prepare(root: Path) -> None:
     """Data, and the canonical scans that `scanimate` is trained on."""
     write_data(root)
     torch.set_num_threads(1)
-    config = canonicalizer_config(root, "nearest", Skinning.nearest)
+    config = canonicalizer_config(root, "nearest", WeightSource.nearest)
     train_canonicalizer(config)
     canonicalize_frames(config)
 
