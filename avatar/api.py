@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import AvatarError
+from avatar.body.model import SMPL_JOINTS, BodyModel
+from avatar.checks import AvatarError, check_shape
 from avatar.data.outfits import Outfit
 from avatar.environment import prepared_process
 from avatar.evaluation.comparison import Comparison
@@ -74,7 +75,6 @@ class Avatar:
         """The names of the J joints that a pose has a row for, the root first."""
         return tuple(self._find(outfit).posable_body().joint_names)
 
-    @prepared_process()
     def pose(
         self,
         pose: np.ndarray,
@@ -121,11 +121,25 @@ class Avatar:
         body = data.posable_body()
         if not isinstance(motion, Motion):
             motion = read_body_motion(Path(motion), body, fps)
-        elif motion.poses.shape[1] != len(body.parents):
-            motion = move_body(motion, body)
+        else:
+            motion = self._own_joints(motion, body)
         dress = self.trained.method.predictor(self.trained, data.name, points, surface or ExtractionConfig())
-        for pose, translation in zip(motion.poses, motion.translations):
-            yield dress(data.fit_pose(pose, translation))
+        for pose, translation in zip(motion.poses, motion.translations, strict=True):
+            with prepared_process():  # for each frame, as the caller has the process in between
+                surface = dress(data.fit_pose(pose, translation))
+            yield surface
+
+    def _own_joints(self, motion: Motion, body: BodyModel) -> Motion:
+        """A motion of arrays as one of the body's joints, after a check of their shapes."""
+        frames = check_shape("poses", motion.poses, "T J 3")["T"]
+        check_shape("translations", motion.translations, "T 3", T=frames)
+        joints, own = motion.poses.shape[1], len(body.parents)
+        if joints not in (own, len(SMPL_JOINTS)):
+            raise AvatarError(
+                f"poses: expected (T, {own}, 3), the body's joints, or (T, {len(SMPL_JOINTS)}, 3), those of SMPL, got "
+                f"{tuple(motion.poses.shape)}. Hint: joint_names() has the body's."
+            )
+        return motion if joints == own else move_body(motion, body)
 
     def garment(self, outfit: str | None = None, points: int = 50_000) -> PointCloud | None:
         """The explicit garment template of an outfit in the canonical pose; None for a method without one."""
@@ -138,12 +152,14 @@ class Avatar:
 def run_settings(*options: str) -> RunConfig:
     """Settings of a training run as the command line composes them from options such as ``"method=pop"``.
 
-    Raises:
-        AvatarError: for values out of range.
-    """
-    from avatar.config import compose_settings  # hydra, which is not needed to load and pose an avatar
+    Paths may have any letters, as there.
 
-    return compose_settings("train", *options)
+    Raises:
+        AvatarError: for unknown options, naming the nearest, and values out of range.
+    """
+    from avatar.config import compose_run  # hydra, which is not needed to load and pose an avatar
+
+    return compose_run(list(options))
 
 
 def to_mesh(surface: Surface | PointCloud, config: PoissonConfig | None = None) -> Mesh:

@@ -89,6 +89,20 @@ def compose_settings(name: str, *overrides: str, verb: Verb | None = None) -> An
         return to_settings(settings_class(verb), hydra.compose(name, list(overrides)))
 
 
+def compose_run(options: list[str]) -> Any:
+    """The settings of a training run, from options as they are written on the command line.
+
+    Raises:
+        AvatarError: for unknown options, and values out of range or of another type.
+    """
+    register("train")
+    options = tidy_arguments(options, texts=text_options(declared(VERBS["train"].settings)))
+    try:
+        return compose_settings("train", *options)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise AvatarError(explain(error, "train", options, CONF)) from error
+
+
 def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | None = None) -> None:
     """Runs a verb from the command line: composes its config, converts it, calls its function with the settings.
 

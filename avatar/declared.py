@@ -2,8 +2,7 @@
 
 Importing a settings class imports the network or the solver that it configures, and torch, which takes seconds. Help,
 composition and the reading of a command line need the fields alone: here the statements that define a class, and those
-that they name, are executed alone. Functions and methods are left out, and with the latter
-the checks of ranges.
+that they name, are executed alone. Functions and methods are left out, and with the latter the checks of ranges.
 """
 
 from __future__ import annotations
@@ -60,8 +59,8 @@ def method_settings() -> dict[str, str]:
     for path in sorted((PACKAGE / "methods").glob("*.py")):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             parts = node.body if isinstance(node, ast.ClassDef) else []
-            given = {part.targets[0].id: part.value for part in parts if isinstance(part, ast.Assign)}
-            if given.keys() >= {"name", "Settings"}:
+            given = {name: part.value for part in parts for name in defined_names(part) if hasattr(part, "value")}
+            if isinstance(given.get("name"), ast.Constant) and isinstance(given.get("Settings"), ast.Name):
                 found[given["name"].value] = f"avatar.methods.{path.stem}:{given['Settings'].id}"
     return found
 

@@ -51,8 +51,17 @@ def test_a_pose_and_a_motion_of_it_give_the_same_surface(page):
     assert np.array_equal(one.cloud.points, next(avatar.animate(motion, points=2_000)).cloud.points)
     with pytest.raises(AvatarError, match="trained on dress, not on 'skirt'"):
         avatar.pose(motion.poses[0], outfit="skirt")
-    with pytest.raises(AvatarError, match="pose"):
+    with pytest.raises(AvatarError, match=r"poses: expected .* got \(1, 5, 3\)"):
         avatar.pose(np.zeros((5, 3)))
+    with pytest.raises(AvatarError, match="translations"):
+        next(avatar.animate(api.Motion(motion.poses, motion.translations[:1], 30.0, "short")))
+
+
+def test_settings_are_read_as_on_the_command_line(tmp_path):
+    folder = tmp_path / "my runs, 2"
+    assert api.run_settings("size=small", f"runs_root={folder}").runs_root == folder
+    with pytest.raises(AvatarError, match=r"train\.stepz.*steps"):
+        api.run_settings("train.stepz=3")
 
 
 def test_scores_of_two_surfaces():

@@ -75,7 +75,7 @@ def uncovered(commands: list[str]) -> list[str]:
 
 
 FOUND = list(dict.fromkeys(command for line in PRINTED if why_not(line.text) is None for command in filled(line.text)))
-RUN = uncovered(FOUND)
+RUN = [command for command in FOUND if command in {*uncovered(FOUND), *(shortened(c) for s in PREPARED for c in s)}]
 
 
 @pytest.fixture(scope="session")

@@ -20,6 +20,7 @@ from avatar.methods.settings import RunConfig
 from avatar.records import Batch, BodyFit, LossTerms, PointCloud, Surface, SurfaceSamples, Template
 
 Inputs = tuple[Any, ...]  # dataclasses of tensors; the first has the ``names`` of its frames
+SEED_STRIDE = 1_000_003  # between the seeds of a run's ranks and tasks, so that a step's draw is that of no other run
 CANONICALIZER = "canonicalizer"  # a method's need: a trained canonicalizer for each outfit
 
 
@@ -197,7 +198,7 @@ class Method(ABC):
         Raises:
             AvatarError: for a method that has no points there.
         """
-        raise AvatarError(f"method: {self.name} predicts no points at chosen places of the body.")
+        raise AvatarError(f"method: expected one with points at chosen places of the body, got {self.name}.")
 
     def garment(
         self, avatar: TrainedAvatar, outfit: str, points: int, body: BodyFit | None = None
@@ -211,4 +212,7 @@ class Method(ABC):
         Raises:
             AvatarError: for a method without codes.
         """
-        raise AvatarError(f"run: {self.name} has no garment code that could be fitted to another outfit.")
+        raise AvatarError(
+            f"run: expected a method with a garment code for each outfit, got {self.name}. Hint: train the new outfit "
+            "by itself."
+        )

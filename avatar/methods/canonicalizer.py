@@ -35,7 +35,7 @@ from avatar.invocation import command_line
 from avatar.io.building import building
 from avatar.io.checkpoints import read_weights
 from avatar.io.documents import read_yaml
-from avatar.methods.base import Inputs, Position, Stage, Task
+from avatar.methods.base import SEED_STRIDE, Inputs, Position, Stage, Task
 from avatar.methods.settings import CANONICALIZERS
 from avatar.records import Frame, LossTerms, Template
 from avatar.settings import settings_from_dict
@@ -46,7 +46,6 @@ CHUNK = 20_000  # points queried at once, or fewer where memory runs out
 POSES = "learned_poses"
 FRAMES_BYTES = 128 << 20  # bytes of whole frames kept; what is learned from them is kept by itself
 SAME_BODY = 1e-3  # metres between the vertices of a canonicalizer's body and an outfit's, at most
-SEED_STRIDE = 1_000_003
 
 
 @dataclass

@@ -22,7 +22,7 @@ from avatar.methods.base import CANONICALIZER, FitOptions, TrainedAvatar
 from avatar.methods.canonicalizer import canonicalizer_folder, load_canonicalizer
 from avatar.methods.points import PointMethod
 from avatar.methods.settings import RunConfig
-from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, bare_body
+from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, TemplateNetwork, bare_body
 from avatar.nn.encoders import Encoder, build_encoder
 from avatar.nn.locality import LocalPoseConfig, LocalPoseEncoder
 from avatar.nn.pointnet2 import PointNet2Config
@@ -92,7 +92,7 @@ class ClosetConfig:
             )
 
 
-class ClosetAvatar(nn.Module):
+class ClosetAvatar(TemplateNetwork):
     """The CloSET network: garment codes and pose encoded on the surface, decoded into a posed oriented point cloud.
 
     For one outfit or many; each outfit is a learned code on the template's vertices. The garment branch does not
@@ -210,20 +210,9 @@ class ClosetAvatar(nn.Module):
             points = transform_points(transforms, canonical)
             return Decoded(points, normalize(transform_directions(transforms, local.normals), dim=-1))
 
-    @torch.no_grad()
-    def garment_template(self, outfit: int, samples: SurfaceSamples) -> Decoded:
-        """The explicit garment template of one outfit in canonical space: points and unit normals ``(1, N, 3)``.
-
-        Raises:
-            AvatarError: when the model has no explicit template.
-        """
-        if not self.config.template:
-            raise AvatarError("template: this model was built without an explicit garment template (template=false).")
-        garment = self.surface_features(self.codes[outfit : outfit + 1], samples)
-        places = interpolate(self.vertices, samples)
-        dressed = bare_body(self.skin_normals, samples, self.config.normals) + self.garment_decoder(garment, places)
-        points = places + dressed.offsets * self.config.offset_scale
-        return Decoded(points, normalize(dressed.normals, dim=-1))
+    def decode_garment(self, codes: Tensor, samples: SurfaceSamples) -> Decoded:
+        """What the garment decoder gives for codes ``(O, ...)``: offsets and normals ``(O, N, 3)``."""
+        return self.garment_decoder(self.surface_features(codes, samples), interpolate(self.vertices, samples))
 
 
 class Closet(PointMethod):

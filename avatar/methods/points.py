@@ -21,7 +21,17 @@ from avatar.environment import choose_device
 from avatar.geometry.chunks import UNIT, in_chunks
 from avatar.geometry.surface import sample_surface
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.methods.base import CANONICALIZER, FitOptions, Inputs, Method, Position, Stage, Task, TrainedAvatar
+from avatar.methods.base import (
+    CANONICALIZER,
+    SEED_STRIDE,
+    FitOptions,
+    Inputs,
+    Method,
+    Position,
+    Stage,
+    Task,
+    TrainedAvatar,
+)
 from avatar.methods.canonicalizer import canonical_outfits
 from avatar.methods.losses import TERMS, point_avatar_loss
 from avatar.methods.settings import Precision, RunConfig, Space, TrainConfig
@@ -107,7 +117,7 @@ class PointTask(Task):
 
     def draw_points(self, key: int) -> SurfaceSamples:
         """The template points that a key draws."""
-        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + key)
+        generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key)
         return draw_samples(self.model, self.template, self.config.points, generator)
 
     def loss(self, inputs: Inputs, position: Position) -> LossTerms:

@@ -15,7 +15,7 @@ from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.geometry.transforms import transform_directions
 from avatar.methods.points import PointMethod
 from avatar.nn.atlas import Atlas, uv_and_patch
-from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, bare_body
+from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, TemplateNetwork, bare_body
 from avatar.nn.unet import UNet, UNetConfig
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
@@ -62,7 +62,7 @@ class PopConfig:
             )
 
 
-class PopAvatar(nn.Module):
+class PopAvatar(TemplateNetwork):
     """The POP network, for one outfit or many: each is a learned feature map beside that of the pose.
 
     The pose map is a U-Net over the posed body's position map. Both maps are looked up at a point's place in the
@@ -143,20 +143,9 @@ class PopAvatar(nn.Module):
             codes=codes,
         )
 
-    @torch.no_grad()
-    def garment_template(self, outfit: int, samples: SurfaceSamples) -> Decoded:
-        """The explicit garment template of one outfit in canonical space: points and unit normals ``(1, N, 3)``.
-
-        Raises:
-            AvatarError: when the model has no explicit template.
-        """
-        if not self.config.template:
-            raise AvatarError("template: this model was built without an explicit garment template (template=false).")
-        garment = self.garment_features(self.codes[outfit : outfit + 1], samples)
-        decoded = self.garment_decoder(garment, self.places(samples))
-        dressed = bare_body(self.skin_normals, samples, self.config.normals) + decoded
-        points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
-        return Decoded(points, normalize(dressed.normals, dim=-1))
+    def decode_garment(self, codes: Tensor, samples: SurfaceSamples) -> Decoded:
+        """What the garment decoder gives for codes ``(O, ...)``: offsets and normals ``(O, N, 3)``."""
+        return self.garment_decoder(self.garment_features(codes, samples), self.places(samples))
 
 
 class Pop(PointMethod):

@@ -25,7 +25,7 @@ from avatar.implicit.extraction import ExtractionConfig
 from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
 from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
 from avatar.io.documents import read_yaml
-from avatar.methods.base import CANONICALIZER, Inputs, Method, Position, Stage, Task, TrainedAvatar
+from avatar.methods.base import CANONICALIZER, SEED_STRIDE, Inputs, Method, Position, Stage, Task, TrainedAvatar
 from avatar.methods.canonicalizer import (
     CanonicalizeConfig,
     WeightSource,
@@ -39,7 +39,6 @@ from avatar.records import BodyFit, LossTerms, Surface, Template
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.world import require_single_process
 
-SEED_STRIDE = 1_000_003
 FIELD = "field."  # prefix of the forward field's weights among the avatar's
 BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that the box's sides are empty
 

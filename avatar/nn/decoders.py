@@ -8,7 +8,7 @@ from enum import Enum
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
+from torch.nn.functional import linear, normalize
 
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate
@@ -59,6 +59,32 @@ def bare_body(skin_normals: Tensor, samples: SurfaceSamples, normals: Normals) -
     start = interpolate(skin_normals, samples)[None]
     zeros = torch.zeros_like(start)
     return Decoded(zeros, start if normals is Normals.body else zeros)
+
+
+class TemplateNetwork(nn.Module):
+    """Base of networks that may have an explicit garment template (CloSET 3.2), decoded without the pose.
+
+    Subclasses have ``config`` (``template``, ``normals``, ``offset_scale``), ``codes (O, ...)``, the body's
+    ``vertices`` and ``skin_normals (V, 3)``, and `decode_garment`.
+    """
+
+    def decode_garment(self, codes: Tensor, samples: SurfaceSamples) -> Decoded:
+        """The garment decoder's offsets and normals ``(O, N, 3)`` for garment codes."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def garment_template(self, outfit: int, samples: SurfaceSamples) -> Decoded:
+        """The explicit garment template of one outfit in canonical space: points and unit normals ``(1, N, 3)``.
+
+        Raises:
+            AvatarError: when the model has no explicit template.
+        """
+        if not self.config.template:
+            raise AvatarError("template: this model was built without an explicit garment template (template=false).")
+        decoded = self.decode_garment(self.codes[outfit : outfit + 1], samples)
+        dressed = bare_body(self.skin_normals, samples, self.config.normals) + decoded
+        points = interpolate(self.vertices, samples) + dressed.offsets * self.config.offset_scale
+        return Decoded(points, normalize(dressed.normals, dim=-1))
 
 
 def softplus_mlp(widths: tuple[int, ...]) -> nn.Sequential:

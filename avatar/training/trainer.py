@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from avatar.checks import AvatarError, DataError
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
-from avatar.methods.base import Inputs, Position, Task
+from avatar.methods.base import SEED_STRIDE, Inputs, Position, Task
 from avatar.nn.shared_norm import synchronize_norms
 from avatar.progress import Progress
 from avatar.records import LossTerms
@@ -228,7 +228,7 @@ class Trainer:
         """
         world, folder = self.world, self.folder / "checkpoints"
         state = broadcast(load_checkpoint(folder) if world.is_main else None, world)
-        torch.manual_seed(self.budget.seed + 1_000_003 * world.rank)
+        torch.manual_seed(self.budget.seed + SEED_STRIDE * world.rank)
         if state is None:
             weights = {name: value.cpu() for name, value in self.model.state_dict().items()}
             self.model.load_state_dict(broadcast(weights, world))

@@ -97,6 +97,14 @@ def test_log_names_every_term_and_the_cycle_only_where_it_is_learned(tmp_path):
     assert rates == pytest.approx([4e-3] * 3 + [4e-4] * 2 + [4e-5] + [1e-3] * 3 + [1e-4] * 2 + [1e-5])
 
 
+def test_a_clock_ends_training_and_stages_keep_their_shares(tmp_path):
+    trainer = make_trainer(tmp_path, first_steps=300_000, second_steps=100_000, minutes=0.01, save_every=10**6)
+    trainer.fit()
+    assert 1 <= trainer.step < 400_000 and trainer.seconds >= 0.6 and trainer.stage == 1
+    trainer.step, trainer.seconds = 1, 0.3
+    assert trainer.position().stage == 0 and trainer.position().progress == pytest.approx(2 / 3)
+
+
 def test_each_stage_has_an_optimiser_of_its_own(tmp_path):
     trainer = make_trainer(tmp_path)
     counts = []
