@@ -125,6 +125,11 @@ class Metric:
     sequential: bool = False
     needs_body: bool = False
 
+    @property
+    def heading(self) -> str:
+        """The name and the unit that it is shown in, where it has one."""
+        return self.name if self.shown_in == "1" else f"{self.name} ({self.shown_in})"
+
 
 def _surface_distance(c: Comparison) -> Tensor:
     if c.mesh is not None:

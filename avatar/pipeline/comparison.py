@@ -13,11 +13,10 @@ from avatar.checks import AvatarError, DataError, check_name
 from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, method_key
 from avatar.evaluation.canonical_scores import canonical_overview, canonical_table
-from avatar.evaluation.curves import plot_fractions, plot_progress, plot_times
 from avatar.evaluation.differences import budget_table, compare_methods, difference_table, differences_csv
 from avatar.evaluation.forms import FormConfig, ReportedTable, form_table, reported_table
 from avatar.evaluation.metrics import find_metrics
-from avatar.evaluation.plots import plot_outfits, save_figure
+from avatar.evaluation.plots import plot_fractions, plot_outfits, plot_progress, plot_times, save_figure
 from avatar.evaluation.scores import Score, Scores, read_scores, write_scores
 from avatar.evaluation.tables import Table, View, outfit_table, to_latex, to_markdown
 from avatar.io.npz import write_whole

@@ -9,8 +9,17 @@ from avatar.checks import AvatarError, check_name
 from avatar.data.outfits import Outfit
 from avatar.environment import prepared_process
 from avatar.evaluation.scoring import Label
-from avatar.evaluation.seam_tables import SeamTest, check_baseline, name_of, seam_differences, seam_table, to_csv
-from avatar.evaluation.seams import SeamPlaces, measure_seams, seam_places
+from avatar.evaluation.seams import (
+    SeamPlaces,
+    SeamTest,
+    check_baseline,
+    measure_seams,
+    name_of,
+    seam_differences,
+    seam_places,
+    seam_table,
+    seams_csv,
+)
 from avatar.evaluation.tables import Table, to_markdown
 from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
@@ -57,7 +66,7 @@ def seams(config: SeamsConfig) -> Path:
         places = seam_places(mine[0][1].template, config.points, config.seed)
         tests[key] = [probe_seams(config, avatar, outfit, places) for avatar, outfit in mine]
     every = [test for mine in tests.values() for test in mine]
-    write_whole(config.out / f"{config.table}.csv", to_csv(every).encode())
+    write_whole(config.out / f"{config.table}.csv", seams_csv(every).encode())
     tables: list[Table] = []
     for mine in tests.values():
         tables.append(seam_table(mine))
