@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from avatar.checks import AvatarError
-from avatar.evaluation.comparison import Comparison
+from avatar.evaluation.metrics import Comparison
 from avatar.evaluation.scores import Scores
 from avatar.evaluation.scoring import (
     Label,

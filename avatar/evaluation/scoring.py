@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from avatar.checks import AvatarError, DataError
-from avatar.evaluation.comparison import Comparison
-from avatar.evaluation.metrics import METRICS, Metric, find_metrics
+from avatar.evaluation.metrics import METRICS, Comparison, Metric, find_metrics
 from avatar.evaluation.scores import FrameScore, Score, Scores
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh
