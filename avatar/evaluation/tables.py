@@ -128,8 +128,10 @@ def metric_table(rows: Sequence[Score], outfit: str) -> Table:
     return replace(table, notes=(*table.notes, FLOOR_NOTE, *counts))
 
 
-def tabulate_metrics(rows: Sequence[Score], outfit: str, metrics: Iterable[Metric]) -> Table:
+def tabulate_metrics(rows: Sequence[Score], outfit: str, metrics: Iterable[Metric], first: str = "") -> Table:
     """Those of some metrics that were scored by methods for one outfit, with their definitions in the notes.
+
+    Floors come first, or the method named ``first``.
 
     Raises:
         AvatarError: for an outfit that nobody scored, or two rows for the same number.
@@ -140,6 +142,7 @@ def tabulate_metrics(rows: Sequence[Score], outfit: str, metrics: Iterable[Metri
     grid = {m: {place.method: cell for place, cell in cells.items() if place.metric == m.name} for m in metrics}
     grid = {metric: _viewed(found, View.VALUE, metric.scale) for metric, found in grid.items() if found}
     methods = order_methods({method for found in grid.values() for method in found})
+    methods.sort(key=lambda method: method != first if first else False)
     body = tuple(TableRow(metric.heading, _values(found, methods)) for metric, found in grid.items())
     return Table(outfit, "metric", tuple(methods), body, tuple(definitions(grid)))
 
