@@ -131,6 +131,10 @@ class Metric:
         return self.name if self.shown_in == "1" else f"{self.name} ({self.shown_in})"
 
 
+METRIC_NAMES = (  # one literal, for settings are read without running the functions below (`avatar.declared`)
+    *("cd_point", "cd_pop", "normal_l1", "normal_l1_mean", "s2m_cm", "normal_consistency", "f_score_5mm"),
+    *("f_score_1cm", "penetration_share", "penetration_depth", "uniformity", "jitter"),
+)
 METRICS: dict[str, Metric] = {}
 
 

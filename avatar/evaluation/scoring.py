@@ -15,7 +15,7 @@ import torch
 
 from avatar.checks import AvatarError, DataError
 from avatar.data.outfits import Outfit
-from avatar.evaluation.metrics import METRICS, Comparison, Metric, find_metrics
+from avatar.evaluation.metrics import METRIC_NAMES, Comparison, Metric, find_metrics
 from avatar.evaluation.scores import FrameScore, Score, Scores
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh
@@ -39,7 +39,7 @@ class ScoreConfig:
     """
 
     scan_points: int = 40_000  # scan points compared a frame; all of them where a scan has fewer
-    metrics: list[str] = field(default_factory=lambda: list(METRICS))
+    metrics: list[str] = field(default_factory=lambda: list(METRIC_NAMES))
     seed: int = 0
     motion: bool = False  # frames follow each other in time and predictions keep point order: adds jitter
 

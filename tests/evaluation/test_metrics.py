@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from avatar.checks import AvatarError
 from avatar.evaluation.metrics import (
     DISC_NEIGHBOURS,
+    METRIC_NAMES,
     METRICS,
     PENETRATION_POINTS,
     SKIN_TOLERANCE,
@@ -240,6 +241,7 @@ def test_unknown_metrics_are_named_with_all_there_are():
 
 
 def test_every_metric_is_defined():
+    assert tuple(METRICS) == METRIC_NAMES
     for name, metric in METRICS.items():
         assert metric.name == name
         assert len(metric.definition) > 40 and metric.definition.endswith(".")
