@@ -35,7 +35,7 @@ from avatar.methods.canonicalizer import (
     load_canonicalizer,
     rate_factor,
 )
-from avatar.pipeline.canonicalization import canonicalize, carrier, score_canonical_scans, weight_colors
+from avatar.pipeline.canonicalization import canonicalize, canonicalizer_with, score_canonical_scans, weight_colors
 from avatar.runs.canonicalizing import canonicalize_frames, skinning_source, train_canonicalizer
 from avatar.training.logs import read_log
 from avatar.training.trainer import Trainer
@@ -369,7 +369,7 @@ def test_a_run_is_scored_against_the_truth_beside_its_rivals(settings, folder):
     assert all(len({f.frame for f in scores.frames if f.variant == split}) == 2 for split in ("train", "test"))
     assert values["nearest", "train", "cycle_cm"] != values["learned", "train", "cycle_cm"]
     frame = settings.frames().frame(0)
-    back = carrier(settings, skinning_source(settings, read_template(folder / "template.npz")))(frame)
+    back = canonicalizer_with(settings, skinning_source(settings, read_template(folder / "template.npz")))(frame)
     assert np.allclose(back.forward_weights.sum(axis=1), 1, atol=1e-5)
     assert "| truth_cm (cm) |" in (folder / "scores.md").read_text()
 
