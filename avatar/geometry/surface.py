@@ -76,5 +76,5 @@ def interpolate(values: Tensor, samples: SurfaceSamples) -> Tensor:
 
 
 def interpolate_transforms(transforms: Tensor, samples: SurfaceSamples) -> Tensor:
-    """Barycentric blend of per-vertex transforms, as POP blends vtransf. ``(..., V, 4, 4)`` to ``(..., N, 4, 4)``."""
+    """Barycentric blend of per-vertex matrices, as POP blends vtransf. ``(..., V, D, D)`` to ``(..., N, D, D)``."""
     return interpolate(transforms.flatten(-2), samples).unflatten(-1, transforms.shape[-2:])

@@ -214,8 +214,7 @@ class PointMethod(Method):
         if body is not None:
             return self.predict_at(avatar, outfit, body, samples, wrinkles=False)
         device = next(avatar.model.parameters()).device
-        decoded = avatar.model.garment_template(avatar.outfit_index(outfit), samples.to(device))
-        return join_clouds([Prediction(decoded.offsets, decoded.normals, decoded.offsets)])
+        return join_clouds([avatar.model.garment_template(avatar.outfit_index(outfit), samples.to(device))])
 
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
         """The garment code ``(1, ...)`` that explains one scan best, begun at the mean of the trained codes.

@@ -18,11 +18,10 @@ from avatar.geometry.surface import interpolate
 from avatar.geometry.transforms import transform_directions
 from avatar.geometry.uv import uv_barycentric
 from avatar.methods.points import PointMethod
-from avatar.nn.atlas import Atlas, uv_and_patch
+from avatar.nn.atlas import Atlas
 from avatar.nn.decoders import DecoderConfig, Normals, ShapeDecoder
-from avatar.nn.pointnet2 import point_mlp
+from avatar.nn.layers import WideLinear, point_mlp
 from avatar.nn.unet import UNet, UNetConfig
-from avatar.nn.wide import WideLinear
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
 PLACE_CHANNELS = 4  # UV coordinates of the patch, and a point's own in the patch
@@ -184,7 +183,7 @@ class ScaleAvatar(nn.Module):
         pixels = spots.floor().long().clamp(0, size - 1)
         patch = self.patch_of_pixel[pixels[:, 1] * size + pixels[:, 0]]
         corners = self.patch_corners[patch]
-        places = uv_and_patch((corners + 0.5) / size, spots - corners)
+        places = torch.cat([(corners + 0.5) / size, spots - corners], dim=-1)
         features = self.pose_features(batch.pose_vertices)
         features = gather_sum(features, SparseRows.of_table(patch[:, None], features.shape[1]))
         local = self.decoder(features, places)

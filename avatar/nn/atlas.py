@@ -93,20 +93,15 @@ class LookUp:
         across, down = torch.stack([1 - (places - low), places - low], dim=-1).unbind(dim=1)
         ids = (rows[:, :, None] * size + columns[:, None]).flatten(1)
         self.size = size
-        self.bags = SparseRows.of_table(ids, size**2, (down[:, :, None] * across[:, None]).flatten(1))
+        self.sparse = SparseRows.of_table(ids, size**2, (down[:, :, None] * across[:, None]).flatten(1))
 
     @cached_property
     def back(self) -> SparseRows:
         """The transposed sums, which the backward pass takes."""
-        return self.bags.transpose()
+        return self.sparse.transpose()
 
     def __call__(self, features: Tensor) -> Tensor:
         """Features ``(B, N, C)`` of images ``(B, C, S, S)``."""
         check_shape("features", features, f"B C {self.size} {self.size}")
-        rows = features.to(self.bags.weights.dtype).flatten(2).transpose(1, 2)
-        return gather_sum(rows, self.bags, self.back if rows.requires_grad else None)
-
-
-def uv_and_patch(uv: Tensor, patch: Tensor) -> Tensor:
-    """What POP's and SCALE's decoders know of a point's place: UV and patch coordinates ``(N, 4)``."""
-    return torch.cat([uv, patch], dim=-1)
+        rows = features.to(self.sparse.weights.dtype).flatten(2).transpose(1, 2)
+        return gather_sum(rows, self.sparse, self.back if rows.requires_grad else None)

@@ -1,4 +1,4 @@
-"""Everything in PointNet++ that depends on the template alone, computed once."""
+"""The point hierarchy of PointNet++ and its sparse gathers: all that depends on the template alone, computed once."""
 
 from __future__ import annotations
 
@@ -33,34 +33,25 @@ class HierarchyConfig:
 
 
 class FixedRows(nn.Module):
-    """Sums of bags that stay the same for good, with their transpose made once: ``(..., V, C)`` to ``(..., R, C)``."""
+    """Weighted sums of rows that stay the same, with their transpose made once: ``(..., V, C)`` to ``(..., R, C)``."""
 
-    def __init__(self, bags: SparseRows):
+    def __init__(self, sparse: SparseRows, shape: tuple[int, ...] = (-1,)):
+        """Keeps the sums; ``shape`` is that of the R results."""
         super().__init__()
-        self.rows, back = bags.rows, bags.transpose()
-        self.register_buffer("ids", bags.ids, persistent=False)
-        self.register_buffer("starts", bags.starts, persistent=False)
-        self.register_buffer("weights", bags.weights, persistent=False)
-        self.register_buffer("back_ids", back.ids, persistent=False)
-        self.register_buffer("back_starts", back.starts, persistent=False)
-        self.register_buffer("back_weights", back.weights, persistent=False)
+        self.rows, self.shape, back = sparse.rows, shape, sparse.transpose()
+        for name in ("ids", "starts", "weights"):
+            self.register_buffer(name, getattr(sparse, name), persistent=False)
+            self.register_buffer(f"back_{name}", getattr(back, name), persistent=False)
+
+    @classmethod
+    def of_groups(cls, groups: Tensor, rows: int) -> FixedRows:
+        """Gathers constant groups ``(S, K)`` of rows: ``(B, N, C)`` to ``(B, S, K, C)``."""
+        return cls(SparseRows.of_table(groups.reshape(-1, 1), rows), groups.shape)
 
     def forward(self, values: Tensor) -> Tensor:
-        bags = SparseRows(self.ids, self.starts, self.weights, self.rows)
+        sparse = SparseRows(self.ids, self.starts, self.weights, self.rows)
         back = SparseRows(self.back_ids, self.back_starts, self.back_weights, len(self.starts))
-        return gather_sum(values, bags, back)
-
-
-class Grouping(nn.Module):
-    """Picks constant groups of rows, ``(B, N, C)`` to ``(B, S, K, C)`` for ids ``(S, K)``."""
-
-    def __init__(self, groups: Tensor, rows: int):
-        super().__init__()
-        self.shape = groups.shape
-        self.pick = FixedRows(SparseRows.of_table(groups.reshape(-1, 1), rows))
-
-    def forward(self, values: Tensor) -> Tensor:
-        return self.pick(values).unflatten(1, self.shape)
+        return gather_sum(values, sparse, back).unflatten(-2, self.shape)
 
 
 class Level(nn.Module):
@@ -84,7 +75,7 @@ class Level(nn.Module):
             "up_weights": inverse / inverse.sum(dim=1, keepdim=True),
         }.items():
             self.register_buffer(name, value.clone(), persistent=False)
-        self.group = Grouping(self.groups, len(finer))
+        self.group = FixedRows.of_groups(self.groups, len(finer))
         self.interpolate_up = FixedRows(SparseRows.of_table(self.up_ids, count, self.up_weights))
 
 

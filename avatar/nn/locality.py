@@ -16,7 +16,7 @@ from avatar.checks import AvatarError
 from avatar.geometry.precision import full_precision
 from avatar.geometry.surface import interpolate
 from avatar.geometry.transforms import relative_quaternions
-from avatar.nn.pointnet2 import PointNorm, point_mlp
+from avatar.nn.layers import PointNorm, point_mlp
 from avatar.records import SurfaceSamples, Template
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from avatar.checks import AvatarError
-from avatar.nn.pointnet2 import PointNorm
+from avatar.nn.layers import PointNorm
 
 
 class _GatherMoments(torch.autograd.Function):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
-from avatar.nn.wide import WideConv2d
+from avatar.nn.layers import WideConv2d
 
 SMOOTH_LEVELS = 3  # the last ones upsample and convolve, for transposed convolutions leave checkerboards
 WIDEST = 8  # times the first level's channels
