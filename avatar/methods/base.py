@@ -1,7 +1,6 @@
-"""Interface of a method: how its network is built, trained, rebuilt from a file, and asked for a dressed surface.
+"""Interface of a method of any kind (points, implicit surface, mesh): one file in this folder, with a `Method` in it.
 
-A method of any kind (points, implicit surface, mesh) is one file in this folder with a `Method` at its end. Trainer,
-prediction, meshing, evaluation and reports know this interface and no method by name.
+Trainer, prediction, meshing, evaluation and reports know this interface and no method by name.
 """
 
 from __future__ import annotations
@@ -9,14 +8,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.methods.losses import LossConfig
-from avatar.methods.settings import RunConfig
+from avatar.methods.settings import FitConfig, RunConfig
 from avatar.records import Batch, BodyFit, LossTerms, PointCloud, Surface, SurfaceSamples, Template
 
 Inputs = tuple[Any, ...]  # dataclasses of tensors; the first has the ``names`` of its frames
@@ -113,16 +111,6 @@ class TrainedAvatar:
         return self.config.outfit.index(name)
 
 
-class FitOptions(Protocol):
-    """Options of fitting a garment code: Adam's steps and rate, template points and their seed, loss weights."""
-
-    steps: int
-    code_lr: float
-    points: int
-    seed: int
-    loss: LossConfig
-
-
 class Method(ABC):
     """One method: a name, a settings class, and everything that depends on the kind of avatar it trains.
 
@@ -179,13 +167,9 @@ class Method(ABC):
     def predictor(
         self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
     ) -> Callable[[BodyFit], Surface]:
-        """A function that dresses posed bodies.
+        """A function from a posed body to its dressed surface, in one of the avatar's outfits.
 
-        Args:
-            avatar: a trained avatar of this method.
-            outfit: one of those it was trained on.
-            points: points a frame, 1,000 to 400,000.
-            surface: resolution of an implicit surface.
+        ``points`` a frame are 1,000 to 400,000; ``surface`` is the resolution of an implicit surface.
         """
 
     def prediction_settings(self, points: int, surface: ExtractionConfig) -> dict[str, Any]:
@@ -206,13 +190,11 @@ class Method(ABC):
         """The explicit garment template, skinned to a body or in the canonical pose; None for a method without one."""
         return None
 
-    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
+    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         """The garment code of an unseen outfit from one scan, for a method with one code an outfit.
 
         Raises:
             AvatarError: for a method without codes.
         """
-        raise AvatarError(
-            f"run: expected a method with a garment code for each outfit, got {self.name}. Hint: train the new outfit "
-            "by itself."
-        )
+        problem = f"run: expected a method with a garment code for each outfit, got {self.name}."
+        raise AvatarError(f"{problem} Hint: train the new outfit by itself.")

@@ -35,14 +35,14 @@ FULL_GARMENT_ENCODER = {
 
 
 class Skinning(Enum):
-    """Whose skinning poses the dressed surface from the canonical pose to a frame's."""
+    """Source of the skinning that poses the dressed surface from the canonical pose to a frame's."""
 
     body = "body"  # CloSET: the transform of the skin an offset starts from
     learned = "learned"  # SCANimate: a canonicalizer's field, asked at the offset point itself
 
 
 class PoseLocality(Enum):
-    """What a point's wrinkles may know of the pose."""
+    """What a point's wrinkles may depend on of the pose."""
 
     whole = "global"  # CloSET: PointNet++ over the posed body, whose coarse levels see all of it
     kinematic = "kinematic"  # SCANimate: the joints near the point in the kinematic tree
@@ -77,10 +77,9 @@ class ClosetConfig:
         if self.train_field and self.skinning is Skinning.body:
             raise AvatarError("train_field: there is a field to train with skinning=learned only.")
         if self.code_channels < 1 or self.code_std < 0 or self.offset_scale <= 0 or self.pose_noise < 0:
-            raise AvatarError(
-                "code_channels, offset_scale: expected positive values, code_std, pose_noise: not negative ones, "
-                f"got {self.code_channels}, {self.offset_scale}, {self.code_std}, {self.pose_noise}."
-            )
+            expected = "code_channels, offset_scale: expected positive values, code_std, pose_noise: not negative ones"
+            got = f"{self.code_channels}, {self.offset_scale}, {self.code_std}, {self.pose_noise}"
+            raise AvatarError(f"{expected}, got {got}.")
 
 
 class ClosetAvatar(TemplateNetwork):
@@ -184,10 +183,8 @@ class Closet(PointMethod):
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
         """As `PointMethod.fit_code`. Raises `AvatarError` with learned skinning, whose fields are the outfits' own."""
         if avatar.settings.skinning is Skinning.learned:
-            raise AvatarError(
-                "run: learned skinning belongs to the outfits it was trained on. Hint: canonicalize and train the new "
-                "one, or fit a run with skinning=body."
-            )
+            hint = "canonicalize and train the new one, or fit a run with skinning=body."
+            raise AvatarError(f"run: learned skinning belongs to the outfits it was trained on. Hint: {hint}")
         return super().fit_code(avatar, batch, options)
 
 

@@ -19,7 +19,7 @@ PLACE_CHANNELS = 4  # UV coordinates, and patch coordinates that are zero: POP's
 
 
 class PointSource(Enum):
-    """Where on the body points are predicted."""
+    """Places on the body where points are predicted."""
 
     grid = "grid"  # POP: the pixels of a square UV grid, which leaves out small triangles
     surface = "surface"  # CloSET: even by area, as the caller draws them
@@ -43,19 +43,12 @@ class PopConfig:
 
     def __post_init__(self):
         if min(self.map_size, self.code_channels) < 1 or self.smoothing < 0:
-            raise AvatarError(
-                "map_size, code_channels: expected at least 1, smoothing: at least 0, "
-                f"got {self.map_size}, {self.code_channels}, {self.smoothing}."
-            )
-        if self.map_size % 2**self.pose_encoder.levels:
-            raise AvatarError(
-                f"map_size: expected a multiple of {2**self.pose_encoder.levels}, as pose_encoder.levels="
-                f"{self.pose_encoder.levels} halvings need, got {self.map_size}."
-            )
+            got = f"{self.map_size}, {self.code_channels}, {self.smoothing}"
+            raise AvatarError(f"map_size, code_channels: expected at least 1, smoothing: at least 0, got {got}.")
+        self.pose_encoder.check_map_size(self.map_size)
         if self.code_std < 0 or self.offset_scale <= 0:
-            raise AvatarError(
-                f"code_std, offset_scale: expected at least 0 and above 0, got {self.code_std}, {self.offset_scale}."
-            )
+            got = f"{self.code_std}, {self.offset_scale}"
+            raise AvatarError(f"code_std, offset_scale: expected at least 0 and above 0, got {got}.")
 
 
 class PopAvatar(TemplateNetwork):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,15 +23,8 @@ from avatar.implicit.body_field import BodyField
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
 from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
-from avatar.io.documents import read_yaml
 from avatar.methods.base import CANONICALIZER, SEED_STRIDE, Inputs, Method, Position, Stage, Task, TrainedAvatar
-from avatar.methods.canonicalizer import (
-    CanonicalizeConfig,
-    WeightSource,
-    canonical_outfits,
-    canonicalizer_folder,
-    load_canonicalizer,
-)
+from avatar.methods.canonicalizer import canonical_outfits, canonicalizer_folder, find_field
 from avatar.methods.points import check_count
 from avatar.methods.settings import Precision, RunConfig, TrainConfig
 from avatar.records import BodyFit, LossTerms, Surface, Template
@@ -40,7 +32,7 @@ from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.world import require_single_process
 
 FIELD = "field."  # prefix of the forward field's weights among the avatar's
-BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that the box's sides are empty
+BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that no surface meets the box's sides
 
 
 @dataclass
@@ -54,10 +46,8 @@ class ImplicitTrainConfig:
 
     def __post_init__(self):
         if not 0 < self.decay <= 1 or any(not 0 < share < 1 for share in self.decay_at):
-            raise AvatarError(
-                f"decay: expected above 0 and at most 1, decay_at: shares between 0 and 1, "
-                f"got {self.decay} and {self.decay_at}."
-            )
+            expected = "decay: expected above 0 and at most 1, decay_at: shares between 0 and 1"
+            raise AvatarError(f"{expected}, got {self.decay} and {self.decay_at}.")
 
     def rate_factor(self, progress: float) -> float:
         """The learning rate's factor from the decays that are past at a share of training."""
@@ -98,7 +88,8 @@ class ImplicitTask(Task):
             body: ``(V, 3)`` canonical body vertices, about which the field is sampled as well.
             config: budget and optimiser.
             settings: points in space, weights of the terms, decay of the learning rate.
-            frames: training frames; checks: held-back ones.
+            frames: training frames.
+            checks: held-back frames.
         """
         self.model, self.body, self.box = model, body, model.box.cpu()
         self.config, self.settings, self.data, self.checks = config, settings, frames, checks
@@ -111,12 +102,10 @@ class ImplicitTask(Task):
         return self.config.rate_factor(step, progress) * self.settings.rate_factor(progress)
 
     def inputs_at(self, step: int) -> tuple[CanonicalBatch, SpacePoints]:
-        """The batch of a step and its points in space."""
         batch = self.data.batch_at(step, self.config.batch)
         return batch, self.space_at(batch, step)
 
     def held_back(self) -> Iterator[tuple[CanonicalBatch, SpacePoints]]:
-        """The held-back frames, always at the same points."""
         for batch in self.checks.ordered() if self.checks else ():
             yield batch, self.space_at(batch, -1)
 
@@ -126,13 +115,11 @@ class ImplicitTask(Task):
         return space_points(batch.points, self.body, self.box, self.settings.probes, generator)
 
     def loss(self, inputs: Inputs, position: Position) -> LossTerms:
-        """The field at a batch's points and at points in space, and its losses."""
         batch, space = inputs
         values = probe_field(self.model, batch.points, space, batch.joint_transforms)
         return implicit_loss(values, batch.normals, self.settings.loss, batch.colors)
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:
-        """The objective and the mean distance on the scan, millimetres."""
         return super().shown(values) | {"surface": f"{values['surface'] * 1e3:.1f}mm"}
 
 
@@ -185,7 +172,6 @@ class Scanimate(Method):
     def predictor(
         self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
     ) -> Callable[[BodyFit], Surface]:
-        """As `Method.predictor`: points spread over the posed surface, and that. Raises without a surface."""
         check_count(points)
         avatar.outfit_index(outfit)
 
@@ -201,10 +187,9 @@ class Scanimate(Method):
 
 
 def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequence[CanonicalFrame]:
-    """The canonical scans of training frames, with the poses they were taken in; read when they are needed.
+    """The canonical scans of training frames with their poses, read when they are needed.
 
-    Raises:
-        DataError: for a scan that is not there, or without colours where they are to be learned.
+    Raises `DataError` for a scan that is not there, or without colours where they are to be learned.
     """
 
     def read(index: int) -> CanonicalFrame:
@@ -215,20 +200,6 @@ def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequen
         return frame
 
     return LruSequence(read, len(names))
-
-
-def find_field(folder: Path, template: Template) -> nn.Module:
-    """The forward skinning field of a canonicalizer's run: the learned one, or the body's for its baselines.
-
-    Baselines (nearest, knn) learn no field. Both are posed by the six nearest body vertices, for with the nearest one
-    alone the posed surface would tear wherever the neighbour changes.
-    """
-    path = folder / "config.yaml"
-    if not path.is_file():
-        raise DataError(path, "no such file.", "Run tools/canonicalize.py to its end.")
-    if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is WeightSource.learned:
-        return load_canonicalizer(folder, "cpu").forward_field
-    return BodyField(template)
 
 
 def describe_field(forward_field: nn.Module) -> dict[str, Any]:

@@ -35,10 +35,9 @@ class PointNet2Config:
         self.propagation = tuple(map(tuple, self.propagation))
         counts = {len(self.hierarchy.points), len(self.abstraction), len(self.propagation)}
         if len(counts) != 1 or not all(self.abstraction + self.propagation):
-            raise AvatarError(
-                "abstraction, propagation: expected one non-empty channel list for each of the "
-                f"{len(self.hierarchy.points)} levels, got {len(self.abstraction)} and {len(self.propagation)}."
-            )
+            expected = f"one non-empty channel list for each of the {len(self.hierarchy.points)} levels"
+            got = f"{len(self.abstraction)} and {len(self.propagation)}"
+            raise AvatarError(f"abstraction, propagation: expected {expected}, got {got}.")
 
 
 class FeaturePropagation(nn.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from torch import Tensor, nn
@@ -23,13 +24,11 @@ class HierarchyConfig:
     def __post_init__(self):
         self.points, self.radii = tuple(self.points), tuple(self.radii)
         if len(self.points) != len(self.radii) or not self.points:
-            raise AvatarError(
-                f"points, radii: expected one radius a level, got {len(self.points)} and {len(self.radii)}."
-            )
-        if any(a <= b for a, b in zip(self.points, self.points[1:])) or min(self.radii) <= 0:
-            raise AvatarError(
-                f"points, radii: expected falling sizes and positive radii, got {self.points}, {self.radii}."
-            )
+            got = f"{len(self.points)} and {len(self.radii)}"
+            raise AvatarError(f"points, radii: expected one radius a level, got {got}.")
+        if any(a <= b for a, b in itertools.pairwise(self.points)) or min(self.radii) <= 0:
+            got = f"{self.points}, {self.radii}"
+            raise AvatarError(f"points, radii: expected falling sizes and positive radii, got {got}.")
 
 
 class FixedRows(nn.Module):
@@ -82,14 +81,12 @@ class Level(nn.Module):
 def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:
     """The levels of a hierarchy over constant points ``(V, 3)``, finest first; nested farthest-point subsets.
 
-    Raises:
-        AvatarError: when the template has no more points than the finest level.
+    Raises `AvatarError` when the template has no more points than the finest level.
     """
-    dims = check_shape("positions", positions, "V 3")
-    if dims["V"] <= config.points[0]:
-        raise AvatarError(
-            f"points: expected a finest level below the template's {dims['V']} vertices, got {config.points[0]}."
-        )
+    count = check_shape("positions", positions, "V 3")["V"]
+    if count <= config.points[0]:
+        expected = f"a finest level below the template's {count} vertices"
+        raise AvatarError(f"points: expected {expected}, got {config.points[0]}.")
     levels, finer = nn.ModuleList(), positions.detach()
     for count, radius in zip(config.points, config.radii):
         levels.append(Level(finer, count, radius, config.neighbours))

@@ -2,47 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from avatar.body.packed import write_template
-from avatar.checks import AvatarError, check_name
+from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
 from avatar.environment import prepared_process
 from avatar.io.checkpoints import write_weights
-from avatar.methods.losses import LossConfig
+from avatar.methods.settings import FitConfig
 from avatar.runs.loading import load_avatar
 from avatar.runs.training import WEIGHTS, save_settings
 from avatar.settings import settings_to_dict
-
-
-@dataclass
-class FitConfig:
-    """Fitting an outfit that a network has not seen, from its first training scan or any other one frame."""
-
-    run: Path = Path("runs/closet/open/several/default")
-    dataset: str = "open"
-    outfit: str = "skirt"
-    frame: str | None = None  # the scan to fit; the first training frame if null
-    data_root: Path = Path("data")
-    runs_root: Path = Path("runs")
-    name: str = "fitted"
-    steps: int = 401  # POP
-    code_lr: float = 5e-4  # POP; divided by ten for the second half
-    points: int = 50000  # template points predicted
-    scan_points: int = 40000
-    seed: int = 0
-    loss: LossConfig = field(default_factory=lambda: LossConfig(normal_start=0.0))
-    device: str = "auto"
-
-    def __post_init__(self):
-        for what in ("name", "dataset", "outfit"):
-            check_name(what, getattr(self, what))
-        if self.steps < 1 or self.code_lr <= 0:
-            raise AvatarError(f"steps, code_lr: expected positive values, got {self.steps} and {self.code_lr}.")
 
 
 @prepared_process()
@@ -56,20 +30,11 @@ def fit_outfit(config: FitConfig) -> Path:
     names = name_frames([outfit], "train", [[frame]])
     batch = FrameDataset([outfit], names, config.scan_points, config.seed).batch_at(0, 1)
     code = avatar.method.fit_code(avatar, batch, config)
-
     choice = replace(avatar.config.method, variant=f"{avatar.config.method.variant}-fitted")
-    fitted = replace(
-        avatar.config,
-        method=choice,
-        dataset=config.dataset,
-        outfit=(config.outfit,),
-        name=config.name,
-        data_root=config.data_root,
-        runs_root=config.runs_root,
-    )
+    same = {option: getattr(config, option) for option in ("dataset", "name", "data_root", "runs_root")}
+    fitted = replace(avatar.config, method=choice, outfit=(config.outfit,), **same)
     save_settings(fitted)
     write_template(fitted.folder / "template.npz", avatar.template)
-    weights = avatar.model.state_dict() | {"codes": code}
     facts = {"config": settings_to_dict(fitted), "steps": config.steps, "seconds": 0.0, "fitted_to": frame}
-    write_weights(fitted.folder / WEIGHTS, weights, facts)
+    write_weights(fitted.folder / WEIGHTS, avatar.model.state_dict() | {"codes": code}, facts)
     return fitted.folder
