@@ -84,10 +84,8 @@ def rotation_between(source: Tensor, target: Tensor) -> Tensor:
     """The smallest rotation that turns one direction onto another. ``(3,)`` each, to ``(3, 3)``.
 
     Opposite directions have many such half turns: the one about a perpendicular nearest a coordinate axis is given.
-    Worked out in float64, so that directions a hair from parallel keep their axis.
-
-    Raises:
-        AvatarError: for a direction of no length.
+    Worked out in float64, so that directions a hair from parallel keep their axis. Raises `AvatarError` for a direction
+    of no length.
     """
     check_shape("source", source, "3")
     check_shape("target", target, "3")

@@ -29,8 +29,7 @@ class UVGrid:
 def check_atlas(uv: Tensor, uv_faces: Tensor, faces: int) -> None:
     """Refuses UV coordinates ``(U, 2)`` and corner indices ``(F, 3)`` that do not belong together.
 
-    Raises:
-        AvatarError: naming what is missing, of another shape, not finite or out of range.
+    Raises `AvatarError` naming what is missing, of another shape, not finite or out of range.
     """
     check_shape("uv", uv, "U 2")
     check_shape("uv_faces", uv_faces, "F 3", F=faces)

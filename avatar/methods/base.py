@@ -103,8 +103,7 @@ class TrainedAvatar:
     def outfit_index(self, name: str) -> int:
         """Index of an outfit among those the avatar was trained on.
 
-        Raises:
-            AvatarError: for an outfit it was not trained on, naming those it was.
+        Raises `AvatarError` for an outfit it was not trained on, naming those it was.
         """
         if name not in self.config.outfit:
             raise AvatarError(f"outfit: this avatar was trained on {', '.join(self.config.outfit)}, not on {name!r}.")
@@ -133,8 +132,7 @@ class Method(ABC):
     def check(self, run: RunConfig, settings: Any) -> None:  # noqa: B027 (nothing to check by default)
         """Check a run before its data are read.
 
-        Raises:
-            AvatarError: for a run that the method cannot train, such as several outfits where it takes one.
+        Raises `AvatarError` for a run that the method cannot train, such as several outfits where it takes one.
         """
 
     def needs(self, run: RunConfig, settings: Any) -> frozenset[str]:
@@ -145,8 +143,7 @@ class Method(ABC):
     def prepare(self, run: RunConfig, settings: Any, template: Template) -> Task:
         """An untrained network with its data and loss, on the run's device.
 
-        Raises:
-            DataError: when something the method needs is missing, naming the command that makes it.
+        Raises `DataError` when something the method needs is missing, naming the command that makes it.
         """
 
     @abstractmethod
@@ -179,8 +176,7 @@ class Method(ABC):
     def predict_at(self, avatar: TrainedAvatar, outfit: str, body: BodyFit, samples: SurfaceSamples) -> PointCloud:
         """The dressed surface at chosen places of the body (``on_body`` methods).
 
-        Raises:
-            AvatarError: for a method that has no points there.
+        Raises `AvatarError` for a method that has no points there.
         """
         raise AvatarError(f"method: expected one with points at chosen places of the body, got {self.name}.")
 
@@ -193,8 +189,7 @@ class Method(ABC):
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         """The garment code of an unseen outfit from one scan, for a method with one code an outfit.
 
-        Raises:
-            AvatarError: for a method without codes.
+        Raises `AvatarError` for a method without codes.
         """
         problem = f"run: expected a method with a garment code for each outfit, got {self.name}."
         raise AvatarError(f"{problem} Hint: train the new outfit by itself.")

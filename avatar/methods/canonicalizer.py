@@ -263,8 +263,7 @@ class TrainedCanonicalizer:
 def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicalizer:
     """The trained canonicalizer of a run's folder.
 
-    Raises:
-        DataError: when the folder is no finished run of learned weights, or a file in it is damaged.
+    Raises `DataError` when the folder is no finished run of learned weights, or a file in it is damaged.
     """
     if not (folder / f"{WEIGHTS}.json").is_file():
         hint = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
@@ -294,8 +293,7 @@ def find_field(folder: Path, template: Template) -> nn.Module:
 def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
     """The folder of an outfit's canonicalizer, ``<runs>/canonical/<dataset>/<outfit>/<name>``, after a check.
 
-    Raises:
-        DataError: with the command that makes it, when it is not there or was made for another body.
+    Raises `DataError` with the command that makes it, when it is not there or was made for another body.
     """
     folder = runs_root / CANONICALIZERS / outfit.dataset / outfit.name / name
     where = [f"dataset={outfit.dataset}", f"outfit={outfit.name}", f"name={name}"]
@@ -320,8 +318,7 @@ def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
 def canonical_outfits(runs_root: Path, outfits: list[Outfit], name: str) -> list[Outfit]:
     """The outfits in canonical space: scans of their canonicalizers' runs in place of the posed ones.
 
-    Raises:
-        DataError: when a training frame's scan has not been canonicalized.
+    Raises `DataError` when a training frame's scan has not been canonicalized.
     """
     resting = []
     for outfit in outfits:

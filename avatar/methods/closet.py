@@ -109,8 +109,7 @@ class ClosetAvatar(TemplateNetwork):
     def skin_with(self, skinning: LearnedSkinning) -> None:
         """Gives a model with ``skinning=learned`` its outfits' fields; they are part of its state from then on.
 
-        Raises:
-            AvatarError: for a model skinned by the body, or fields of another number of outfits.
+        Raises `AvatarError` for a model skinned by the body, or fields of another number of outfits.
         """
         if self.config.skinning is not Skinning.learned:
             raise AvatarError("skinning: this model is skinned by the body (skinning=body) and takes no fields.")
@@ -135,8 +134,7 @@ class ClosetAvatar(TemplateNetwork):
     def pose_points(self, local: Decoded, batch: Batch, samples: SurfaceSamples) -> Prediction:
         """As `TemplateNetwork.pose_points`, with learned skinning by the fields of the batch's outfits.
 
-        Raises:
-            AvatarError: with learned skinning, before `skin_with` gave the model its fields.
+        Raises `AvatarError` with learned skinning, before `skin_with` gave the model its fields.
         """
         if self.config.skinning is Skinning.body or batch.canonical:
             return super().pose_points(local, batch, samples)
@@ -191,8 +189,7 @@ class Closet(PointMethod):
 def learned_skinning(runs_root: Path, outfits: list[Outfit], name: str, trainable: bool) -> LearnedSkinning:
     """Forward fields of the outfits' canonicalizers, ready to pose an avatar.
 
-    Raises:
-        DataError: when a canonicalizer is not there, or learned no field (weights=nearest, knn).
+    Raises `DataError` when a canonicalizer is not there, or learned no field (weights=nearest, knn).
     """
     folders = [canonicalizer_folder(runs_root, outfit, name) for outfit in outfits]
     fields = [load_canonicalizer(folder, "cpu").forward_field for folder in folders]

@@ -8,7 +8,8 @@ from enum import Enum
 from torch import Tensor
 
 from avatar.checks import AvatarError
-from avatar.geometry.distances import correspond, normal_difference, point_to_plane, point_to_point
+from avatar.geometry.distances import normal_difference, point_to_plane, point_to_point
+from avatar.geometry.neighbours import correspond
 from avatar.geometry.sparse import gather_rows
 from avatar.records import Batch, LossTerms, Prediction
 

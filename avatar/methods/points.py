@@ -34,11 +34,7 @@ CHUNK = 100_000  # points decoded at once, or fewer where memory runs out; the n
 
 
 def check_count(points: int) -> None:
-    """Check a number of points a frame.
-
-    Raises:
-        AvatarError: for a count out of 1,000 to 400,000.
-    """
+    """Check a number of points a frame. Raises `AvatarError` for a count out of 1,000 to 400,000."""
     if not 1000 <= points <= MAX_POINTS:
         raise AvatarError(f"points: expected 1,000 to {MAX_POINTS:,}, got {points}.")
 
@@ -228,8 +224,7 @@ class PointMethod(Method):
 def template_samples(avatar: TrainedAvatar, points: int) -> SurfaceSamples:
     """The template points a prediction is made at: spread evenly by area, always the same, or the network's own.
 
-    Raises:
-        AvatarError: for a count out of 1,000 to 400,000.
+    Raises `AvatarError` for a count out of 1,000 to 400,000.
     """
     check_count(points)
     return draw_samples(avatar.model, avatar.template, points, torch.Generator().manual_seed(0))

@@ -12,9 +12,8 @@ from torch.nn.functional import normalize, pad
 
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.neighbours import nearest
-from avatar.geometry.sampling import farthest_points
 from avatar.geometry.sparse import SparseRows, gather_sum
-from avatar.geometry.surface import interpolate
+from avatar.geometry.surface import farthest_points, interpolate
 from avatar.geometry.transforms import transform_directions
 from avatar.geometry.uv import uv_barycentric
 from avatar.methods.points import PointMethod
@@ -93,8 +92,7 @@ class ScaleAvatar(nn.Module):
     def __init__(self, template: Template, outfits: int, config: ScaleConfig):
         """Builds the network on a body template with UV coordinates.
 
-        Raises:
-            AvatarError: for more than one outfit, which SCALE has no code for.
+        Raises `AvatarError` for more than one outfit, which SCALE has no code for.
         """
         super().__init__()
         if outfits != 1:

@@ -18,11 +18,7 @@ class Atlas(nn.Module):
     """A body's UV atlas with a position map of a fixed size."""
 
     def __init__(self, template: Template, map_size: int):
-        """Rasterises a template's atlas once.
-
-        Raises:
-            AvatarError: for a template without UV coordinates.
-        """
+        """Rasterises a template's atlas once. Raises `AvatarError` for a template without UV coordinates."""
         super().__init__()
         if template.uv is None or template.uv_faces is None:
             raise AvatarError(

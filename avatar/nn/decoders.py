@@ -181,8 +181,7 @@ class TemplateNetwork(nn.Module):
     def garment_template(self, outfit: int, samples: SurfaceSamples) -> Prediction:
         """The explicit garment template of one outfit in canonical space, as a prediction of one frame.
 
-        Raises:
-            AvatarError: when the model has no explicit template.
+        Raises `AvatarError` when the model has no explicit template.
         """
         if not self.config.template:
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.neighbours import ball_query, k_nearest
-from avatar.geometry.sampling import farthest_points
 from avatar.geometry.sparse import SparseRows, gather_sum
+from avatar.geometry.surface import farthest_points
 
 
 @dataclass

@@ -74,10 +74,8 @@ def synchronize_norms(model: nn.Module, replicated: Collection[str] = ()) -> Non
     """Turns the batch normalisations of a model into `SharedNorm`s, in place; names and weights stay the same.
 
     Those of the ``replicated`` submodules stay as they are: every process runs them on all outfits of the step
-    (`step_outfits`), so each has the whole batch's statistics by itself.
-
-    Raises:
-        AvatarError: for a kind of normalisation whose statistics it would not know how to synchronise.
+    (`step_outfits`), so each has the whole batch's statistics by itself. Raises `AvatarError` for a kind of
+    normalisation whose statistics it would not know how to synchronise.
     """
     for path, parent in list(model.named_modules()):
         if path.partition(".")[0] in replicated:

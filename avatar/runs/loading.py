@@ -49,8 +49,7 @@ def choose_weights(
 ) -> tuple[dict[str, Tensor], int, float]:
     """Weights, steps and seconds of a run: the ``last``, which are given, or those of its ``best`` checkpoint.
 
-    Raises:
-        DataError: for the best of a run that held no frames back.
+    Raises `DataError` for the best of a run that held no frames back.
     """
     if checkpoint == "last":
         return last, int(facts["steps"]), float(facts["seconds"])

@@ -52,7 +52,7 @@ def predict_frames(
         meshes: where ``<frame>.ply`` with the surface goes, for a method that has one.
         points: points a frame, 1,000 to 400,000.
         surface: resolution of an implicit surface.
-        keep: which frames, by name; all of them by default.
+        keep: which frames, by name.
     """
     poses = [
         Pose(name, lambda name=name: outfit.load(split, name).body, outfit.digest(split, name))

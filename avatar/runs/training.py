@@ -31,9 +31,8 @@ WEIGHTS = "avatar"  # avatar.safetensors and avatar.json in the run's folder
 def train(config: RunConfig) -> Path:
     """Trains a run by its method, or resumes it, and writes its weights to share; gives the run's folder.
 
-    Raises:
-        AvatarError: for unknown names or options, and when the folder holds a run with other settings.
-        DataError: when something the method needs is missing, naming the command that makes it.
+    Raises `AvatarError` for unknown names or options, and when the folder holds a run with other settings. Raises
+    `DataError` when something the method needs is missing, naming the command that makes it.
     """
     method = find_method(config.method.name)
     settings = settings_from_dict(method.Settings, config.method.settings, "method.settings.")
@@ -56,10 +55,8 @@ def train(config: RunConfig) -> Path:
 def save_settings(config: RunConfig) -> None:
     """Writes the run's ``config.yaml``, or checks that a run to go on with has the same settings.
 
-    The budget (``train.steps``, ``train.minutes``) and bookkeeping may change between the two.
-
-    Raises:
-        AvatarError: naming the options that differ.
+    The budget (``train.steps``, ``train.minutes``) and bookkeeping may change between the two. Raises `AvatarError`
+    naming the options that differ.
     """
     path = config.folder / "config.yaml"
     plain = settings_to_dict(config)
