@@ -17,10 +17,10 @@ from avatar.checks import AvatarError
 from avatar.data.outfits import Outfit
 from avatar.geometry.surface import interpolate
 from avatar.geometry.transforms import transform_directions, transform_points
-from avatar.methods.base import CANONICALIZER, FitOptions, TrainedAvatar
+from avatar.methods.base import CANONICALIZER, TrainedAvatar
 from avatar.methods.canonicalizer import canonicalizer_folder, load_canonicalizer
 from avatar.methods.points import PointMethod
-from avatar.methods.settings import RunConfig
+from avatar.methods.settings import FitConfig, RunConfig
 from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, TemplateNetwork
 from avatar.nn.encoders import ENCODERS, Encoder, PointNet2Config
 from avatar.nn.locality import LocalPoseConfig, LocalPoseEncoder
@@ -178,7 +178,7 @@ class Closet(PointMethod):
             model.skin_with(rebuild_skinning(facts["fields"], template))
         return model
 
-    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
+    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         """As `PointMethod.fit_code`. Raises `AvatarError` with learned skinning, whose fields are the outfits' own."""
         if avatar.settings.skinning is Skinning.learned:
             hint = "canonicalize and train the new one, or fit a run with skinning=body."

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
 from avatar.checks import AvatarError, DataError
@@ -161,12 +161,20 @@ class Scanimate(Method):
         return ImplicitAvatar(template, BodyField(template), box, settings.avatar)
 
     def describe(self, model: ImplicitAvatar) -> dict[str, Any]:
-        return {"box": model.box.tolist(), "field": describe_field(model.field)}
+        learned = not isinstance(model.field, BodyField)
+        field = {"learned": settings_to_dict(model.field.config)} if learned else {"neighbours": model.field.neighbours}
+        return {"box": model.box.tolist(), "field": field}
 
     def rebuild(
         self, settings: ScanimateConfig, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping
     ) -> ImplicitAvatar:
-        skinning = build_field(facts["field"], template, weights)
+        if "neighbours" in facts["field"]:
+            skinning = BodyField(template, facts["field"]["neighbours"])
+        else:
+            field_settings = settings_from_dict(SkinningFieldConfig, facts["field"]["learned"])
+            skinning = SkinningField(len(template.parents), field_settings, template.vertices[:2])
+            own = {name.removeprefix(FIELD): value for name, value in weights.items() if name.startswith(FIELD)}
+            skinning.load_state_dict(own)
         return ImplicitAvatar(template, skinning, torch.tensor(facts["box"]), settings.avatar)
 
     def predictor(
@@ -200,21 +208,3 @@ def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequen
         return frame
 
     return LruSequence(read, len(names))
-
-
-def describe_field(forward_field: nn.Module) -> dict[str, Any]:
-    """What `build_field` needs, beside the weights, to make a forward field again."""
-    if isinstance(forward_field, BodyField):
-        return {"neighbours": forward_field.neighbours}
-    return {"learned": settings_to_dict(forward_field.config)}
-
-
-def build_field(facts: dict[str, Any], template: Template, weights: dict[str, Tensor]) -> nn.Module:
-    """The forward field of a run's own facts and weights; the canonicalizer's folder is not looked at."""
-    if "neighbours" in facts:
-        return BodyField(template, facts["neighbours"])
-    settings = settings_from_dict(SkinningFieldConfig, facts["learned"])
-    forward_field = SkinningField(len(template.parents), settings, template.vertices[:2])
-    own = {name.removeprefix(FIELD): value for name, value in weights.items() if name.startswith(FIELD)}
-    forward_field.load_state_dict(own)
-    return forward_field

@@ -64,8 +64,7 @@ class Atlas(nn.Module):
     def pixel_points(self, points: int) -> SurfaceSamples:
         """The surface under the pixels of the square grid that has nearest to ``points`` of them in the atlas.
 
-        On SMPL's atlas 50,701 asks for the 256 x 256 grid of POP; on the open body, whose atlas fills 63% of the
-        square, 50,000 gives 282 x 282.
+        On SMPL's atlas 50,701 give POP's 256 x 256 grid; on the open body's 50,000 give 282 x 282.
         """
         if self._asked is None or self._asked[0] != points:
             size = max(1, round(math.sqrt(points / float(uv_areas(self.uv, self.uv_faces).sum()))))
@@ -74,10 +73,10 @@ class Atlas(nn.Module):
 
 
 class LookUp:
-    """Bilinear interpolation of feature images at UV coordinates, in their precision: in half it would be pixels off.
+    """Bilinear interpolation of feature images at UV coordinates, in the coordinates' precision.
 
-    Beyond the outermost centres of pixels an image goes on as it ends. A weighted sum of four pixels a point, which is
-    faster than ``grid_sample`` and repeatable: the backward pass of that adds in an order of chance on CUDA.
+    Beyond the outermost centres of pixels an image is constant. A weighted sum of four pixels a point, faster than
+    ``grid_sample`` and repeatable: the backward pass of that adds in a random order on CUDA.
     """
 
     def __init__(self, uv: Tensor, size: int):

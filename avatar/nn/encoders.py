@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -68,31 +68,23 @@ class SurfaceEncoder(nn.Module):
 
     The template's vertices are the point cloud; what changes from frame to frame (posed vertices, a garment code)
     comes as features. All sampling and grouping is computed once, with the hierarchy.
+
+    ``stage(level, channels, widths)`` makes what goes down one level, ``(B, N, C)`` features of the finer level to
+    ``(B, S, C')`` of the coarser; the last of its widths is C'. A ``stem`` of the first stage's width may come before.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        levels: Sequence[Level],
-        config: PointNet2Config,
-        stages: Iterable[nn.Module],
-        stem: nn.Module | None = None,
-    ):
-        """Builds the encoder around its stages.
+    stage: Callable[[Level, int, tuple[int, ...]], nn.Module]
+    has_stem = False
 
-        Args:
-            channels: input features a vertex.
-            levels: of the hierarchy, finest first.
-            config: the last number of each list of channels is the width that a stage or propagation gives.
-            stages: one a level, ``(B, N, C)`` features of the finer level to ``(B, S, C')`` of the coarser.
-            stem: what comes before them, of the first stage's width.
-        """
+    def __init__(self, template: Template, channels: int, config: PointNet2Config):
+        """Builds the encoder for one template and ``channels`` input features a vertex."""
         super().__init__()
         self.channels, self.out_channels = channels, config.propagation[-1][-1]
-        self.stem = stem or nn.Identity()
-        self.abstractions = nn.ModuleList(stages)
+        levels = build_levels(template.vertices, config.hierarchy)
         widths = [widths[-1] for widths in config.abstraction]
-        widths = [widths[0] if stem else channels, *widths]
+        self.stem = point_mlp((channels, widths[0]), WideLinear) if self.has_stem else nn.Identity()
+        widths.insert(0, widths[0] if self.has_stem else channels)
+        self.abstractions = nn.ModuleList(map(self.stage, levels, widths, config.abstraction))
         self.propagations, coarse = nn.ModuleList(), widths.pop()
         for level, mlp in zip(reversed(levels), config.propagation):
             self.propagations.append(FeaturePropagation(level, coarse, widths.pop(), mlp))
@@ -136,11 +128,7 @@ class SetAbstraction(nn.Module):
 class PointNet2(SurfaceEncoder):
     """PointNet++: features on the template's vertices to one vector for each of them."""
 
-    def __init__(self, template: Template, channels: int, config: PointNet2Config):
-        """Builds the encoder for one template and ``channels`` input features a vertex."""
-        levels = build_levels(template.vertices, config.hierarchy)
-        incoming = [channels, *(mlp[-1] for mlp in config.abstraction)]
-        super().__init__(channels, levels, config, map(SetAbstraction, levels, incoming, config.abstraction))
+    stage = SetAbstraction
 
 
 def two_layers(width: int, inner: int) -> nn.Sequential:
@@ -213,16 +201,11 @@ class PointMLPLevel(nn.Module):
 class PointMLP(SurfaceEncoder):
     """PointMLP (ICLR 2022): residual point networks on neighbourhoods in a common scale.
 
-    It takes the settings of PointNet++ and reads a level's channels as the inner widths of its residual blocks
-    (before and after the maximum alike) followed by its width. Neighbours are PointNet++'s balls, not the paper's k
-    nearest, and the way back up is PointNet++'s feature propagation.
+    A level's channels are the inner widths of its residual blocks (before and after the maximum alike), then its width.
+    Neighbours are PointNet++'s balls, not the paper's k nearest, and the way back up is its feature propagation.
     """
 
-    def __init__(self, template: Template, channels: int, config: PointNet2Config):
-        """Builds the encoder for one template and ``channels`` input features a vertex."""
-        levels = build_levels(template.vertices, config.hierarchy)
-        incoming = [channels, *(widths[-1] for widths in config.abstraction)]
-        super().__init__(channels, levels, config, map(PointMLPLevel, levels, incoming, config.abstraction))
+    stage = PointMLPLevel
 
 
 class Neighbourhoods(nn.Module):
@@ -252,28 +235,27 @@ class InvertedResidual(nn.Module):
         return relu(features + self.mixing(self.aggregation(features)))
 
 
+class PointNeXtLevel(nn.Sequential):
+    """One stage: a set abstraction, then inverted residual blocks that look twice as far."""
+
+    def __init__(self, level: Level, channels: int, widths: tuple[int, ...]):
+        *inner, width = widths
+        down = Neighbourhoods(level.positions, level.finer_positions, level.groups, level.radius)
+        reach, count = 2 * level.radius, min(level.groups.shape[1], len(level.groups))
+        groups = ball_query(level.positions, level.positions, reach, count)
+        around = Neighbourhoods(level.positions, level.positions, groups, reach)
+        blocks = (InvertedResidual(around, width, wide) for wide in inner)
+        super().__init__(SetAbstraction(down, channels, (width,)), *blocks)
+
+
 class PointNeXt(SurfaceEncoder):
     """PointNeXt (NeurIPS 2022): PointNet++ with radius-normalised positions and residual blocks.
 
-    It takes the settings of PointNet++ and reads a level's channels as the inner widths of its inverted residual
-    blocks (the paper: four times the width) followed by its width. A stem of the first level's width comes before
-    all; the blocks look twice as far as the set abstraction before them, as the radius doubles with each level.
+    A level's channels are the inner widths of its blocks (the paper: four times the width), then its width.
     """
 
-    def __init__(self, template: Template, channels: int, config: PointNet2Config):
-        """Builds the encoder for one template and ``channels`` input features a vertex."""
-        sizes = config.hierarchy
-        levels = build_levels(template.vertices, sizes)
-        incoming = config.abstraction[0][-1]
-        stem, stages = point_mlp((channels, incoming), WideLinear), []
-        for level, radius, (*inner, width) in zip(levels, sizes.radii, config.abstraction):
-            down = Neighbourhoods(level.positions, level.finer_positions, level.groups, radius)
-            groups = ball_query(level.positions, level.positions, 2 * radius, min(sizes.neighbours, len(level.groups)))
-            around = Neighbourhoods(level.positions, level.positions, groups, 2 * radius)
-            blocks = (InvertedResidual(around, width, wide) for wide in inner)
-            stages.append(nn.Sequential(SetAbstraction(down, incoming, (width,)), *blocks))
-            incoming = width
-        super().__init__(channels, levels, config, stages, stem)
+    stage = PointNeXtLevel
+    has_stem = True
 
 
 class Encoder(Enum):

@@ -58,11 +58,12 @@ class Level(nn.Module):
 
     Buffers: ``positions (S, 3)`` of this level's points, ``finer_positions (N, 3)``, ``groups (S, K)`` ball-query
     neighbours in the finer level, ``up_ids (N, 3)`` and ``up_weights (N, 3)`` inverse-squared-distance weights of
-    the three nearest coarse points (PointNet++ eq. 2). ``group`` and ``interpolate_up`` are what is done with them.
+    the three nearest coarse points (PointNet++ eq. 2).
     """
 
     def __init__(self, finer: Tensor, count: int, radius: float, neighbours: int):
         super().__init__()
+        self.radius = radius
         coarse = finer[farthest_points(finer, count)]
         up_ids = k_nearest(finer[None], coarse[None], min(3, count))[0]
         inverse = 1 / ((finer[:, None] - coarse[up_ids]).square().sum(dim=-1) + 1e-8)

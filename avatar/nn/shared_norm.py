@@ -40,7 +40,7 @@ class SharedNorm(_BatchNorm):
     dimension = -1  # of the channels
 
     def _check_input_dim(self, features: Tensor) -> None:
-        """Any shape with channels in `dimension` will do."""
+        """Accepts any shape with channels in `dimension`."""
 
     def forward(self, features: Tensor) -> Tensor:
         """Normalises ``(..., C, ...)`` features; in evaluation by the running statistics."""

@@ -45,15 +45,15 @@ class Doubling(nn.Module):
     """
 
     def forward(self, image: Tensor) -> Tensor:
-        rows, columns = (doubling_matrix(size, image) for size in image.shape[-2:])
+        rows, columns = (self.weights(size, image) for size in image.shape[-2:])
         return rows @ image @ columns.T
 
-
-def doubling_matrix(size: int, like: Tensor) -> Tensor:
-    """Weights ``(2 size, size)`` of linear interpolation between centres of pixels, constant beyond the outermost."""
-    centres = torch.arange(size, device=like.device)
-    places = (torch.arange(2 * size, device=like.device) / 2 - 0.25).clamp(0, size - 1)
-    return (1 - (places[:, None] - centres).abs()).clamp(min=0).to(like.dtype)
+    @staticmethod
+    def weights(size: int, like: Tensor) -> Tensor:
+        """Weights ``(2 size, size)`` between the centres of pixels, constant beyond the outermost."""
+        centres = torch.arange(size, device=like.device)
+        places = (torch.arange(2 * size, device=like.device) / 2 - 0.25).clamp(0, size - 1)
+        return (1 - (places[:, None] - centres).abs()).clamp(min=0).to(like.dtype)
 
 
 class UNet(nn.Module):
