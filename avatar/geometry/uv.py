@@ -11,7 +11,7 @@ from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.surface import interpolate
 from avatar.records import SurfaceSamples
 
-INSIDE = 1e-12  # how far below zero rounding may carry a barycentric coordinate of a point on an edge
+INSIDE = 1e-12  # how far below zero rounding may take a barycentric coordinate of a point on an edge
 
 
 @dataclass(frozen=True)
@@ -45,15 +45,9 @@ def rasterise_uv(uv: Tensor, uv_faces: Tensor, faces: Tensor, size: int) -> UVGr
 
     Pixel (row, column) has its centre at ``u = (column + 1/2) / size``, ``v = (row + 1/2) / size``, which is also
     where ``grid_sample`` with ``align_corners=False`` places it. It belongs to the triangle that holds its centre,
-    borders included; to that with the lowest index where there are several.
-
-    Args:
-        uv: ``(U, 2)`` in [0, 1]; uv_faces: ``(F, 3)`` indices into it.
-        faces: ``(F, 3)`` the same triangles' vertices on the surface.
-        size: pixels a side.
-
-    Raises:
-        AvatarError: for coordinates out of [0, 1], a size below 1, or an atlas that covers no pixel.
+    borders included; to that with the lowest index where there are several. ``uv (U, 2)`` are in [0, 1], ``uv_faces``
+    and ``faces (F, 3)`` a triangle's corners in the atlas and on the surface. Raises `AvatarError` for coordinates out
+    of [0, 1], a size below 1, or an atlas that covers no pixel.
     """
     check_atlas(uv, uv_faces, check_shape("faces", faces, "F 3")["F"])
     if size < 1:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from avatar.checks import AvatarError
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.methods.settings import FitConfig, RunConfig
-from avatar.records import Batch, BodyFit, LossTerms, PointCloud, Surface, SurfaceSamples, Template
+from avatar.records import Batch, BodyFit, LossTerms, PointCloud, SurfaceSamples, Template
 
 Inputs = tuple[Any, ...]  # dataclasses of tensors; the first has the ``names`` of its frames
 SEED_STRIDE = 1_000_003  # between the seeds of a run's ranks and tasks, so that a step's draw is that of no other run
@@ -155,16 +155,12 @@ class Method(ABC):
         return {}
 
     @abstractmethod
-    def rebuild(
-        self, settings: Any, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping[str, Tensor]
-    ) -> nn.Module:
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
         """The network of a finished run, its weights still to be loaded."""
 
     @abstractmethod
-    def predictor(
-        self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
-    ) -> Callable[[BodyFit], Surface]:
-        """A function from a posed body to its dressed surface, in one of the avatar's outfits.
+    def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
+        """A function from a `BodyFit` to its dressed `Surface`, in one of the avatar's outfits.
 
         ``points`` a frame are 1,000 to 400,000; ``surface`` is the resolution of an implicit surface.
         """

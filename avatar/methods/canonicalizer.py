@@ -87,7 +87,7 @@ class CycleConfig:
         """Both stages' steps."""
         return self.first_steps + self.second_steps
 
-    def rate_factor(self, progress: float) -> float:
+    def rate_factor(self, step: int, progress: float) -> float:
         """The learning rate's factor at a share of a stage: it falls at half and at three quarters."""
         return self.decay ** ((progress >= 0.5) + (progress >= 0.75))
 
@@ -113,11 +113,7 @@ class CanonicalizerTask(Task):
         self.frames, self.batch = len(scans), config.batch
         self.groups = (list(model.parameters()),)
         plan = ((config.first_steps, config.first_lr), (config.second_steps, config.second_lr))
-        self.stages = tuple(Stage(steps / config.steps, (rate,), self.rate_factor) for steps, rate in plan if steps)
-
-    def rate_factor(self, step: int, progress: float) -> float:
-        """The learning rate's factor at a share of a stage."""
-        return self.config.rate_factor(progress)
+        self.stages = tuple(Stage(steps / config.steps, (rate,), config.rate_factor) for steps, rate in plan if steps)
 
     def inputs_at(self, step: int) -> tuple[ScanBatch]:
         places = torch.arange(step * self.config.batch, (step + 1) * self.config.batch)
@@ -156,7 +152,7 @@ def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start:
     nearest, weights = NearestWeights(template, code.device), template.weights.cpu()
     optimiser = torch.optim.Adam([code], lr=config.code_lr)
     for step in range(config.code_steps):
-        optimiser.param_groups[0]["lr"] = config.code_lr * config.rate_factor(step / config.code_steps)
+        optimiser.param_groups[0]["lr"] = config.code_lr * config.rate_factor(step, step / config.code_steps)
         generator = torch.Generator().manual_seed(config.seed * SEED_STRIDE + step)
         batch = draw_batch([scan], [0], weights, config.draw, generator).to(code.device)
         cycle = model(batch, code[None], together=True)

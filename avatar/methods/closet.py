@@ -170,12 +170,13 @@ class Closet(PointMethod):
             return {}
         return {"fields": [settings_to_dict(skin.config) for skin in model.skinning.fields]}
 
-    def rebuild(
-        self, settings: ClosetConfig, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping
-    ) -> ClosetAvatar:
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> ClosetAvatar:
         model = super().rebuild(settings, template, outfits, facts, weights)
         if settings.skinning is Skinning.learned:
-            model.skin_with(rebuild_skinning(facts["fields"], template))
+            box = torch.tensor([[-1.0], [1.0]]).expand(2, 3)  # the fields' sizes alone matter: their state is loaded
+            configs = [settings_from_dict(SkinningFieldConfig, values, "fields.") for values in facts["fields"]]
+            fields = [SkinningField(len(template.parents), config, box) for config in configs]
+            model.skin_with(LearnedSkinning(fields, [template] * len(fields)))
         return model
 
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
@@ -194,11 +195,3 @@ def learned_skinning(runs_root: Path, outfits: list[Outfit], name: str, trainabl
     folders = [canonicalizer_folder(runs_root, outfit, name) for outfit in outfits]
     fields = [load_canonicalizer(folder, "cpu").forward_field for folder in folders]
     return LearnedSkinning(fields, [outfit.template for outfit in outfits], trainable)
-
-
-def rebuild_skinning(described: list[dict[str, Any]], template: Template) -> LearnedSkinning:
-    """Skinning of the described sizes on a body of the run's topology, its state still to be loaded."""
-    box = torch.tensor([[-1.0], [1.0]]).expand(2, 3)
-    configs = [settings_from_dict(SkinningFieldConfig, values, "fields.") for values in described]
-    fields = [SkinningField(len(template.parents), config, box) for config in configs]
-    return LearnedSkinning(fields, [template] * len(fields))

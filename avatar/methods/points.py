@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
@@ -169,14 +169,10 @@ class PointMethod(Method):
         model = self.build(run, settings, template, outfits).to(choose_device(run.device))
         return PointTask(model, template, train, batch_at, len(frames), validation)
 
-    def rebuild(
-        self, settings: Any, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping[str, Tensor]
-    ) -> nn.Module:
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
         return self.network(template, outfits, settings)
 
-    def predictor(
-        self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
-    ) -> Callable[[BodyFit], Surface]:
+    def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
         samples = template_samples(avatar, points)
         return lambda body: Surface(self.predict_at(avatar, outfit, body, samples))
 

@@ -161,15 +161,10 @@ class ScaleAvatar(nn.Module):
         return torch.cat([edges, (normals * length).unsqueeze(-1)], dim=-1)
 
     def forward(self, batch: Batch, samples: SurfaceSamples) -> Prediction:
-        """Predicts the dressed surface of each frame at template points.
+        """Predicts the dressed surface of each frame at N points: those of `template_samples` or any on the body.
 
-        Args:
-            batch: posed bodies (its scans are not looked at).
-            samples: N points, those of `template_samples` or any others on the body.
-
-        Returns:
-            `Prediction` with ``x = T r + p``, p a patch's place on the posed body and T its triangle's frame.
-            ``offsets`` are ``T r``: r counts in edges of a triangle, which the regulariser could not compare.
+        ``x = T r + p``, p a patch's place on the posed body and T its triangle's frame. The ``offsets`` of the result
+        are ``T r``: r counts in edges of a triangle, which the regulariser could not compare.
         """
         check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=self.vertex_count)
         size = self.config.map_size

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -165,9 +165,7 @@ class Scanimate(Method):
         field = {"learned": settings_to_dict(model.field.config)} if learned else {"neighbours": model.field.neighbours}
         return {"box": model.box.tolist(), "field": field}
 
-    def rebuild(
-        self, settings: ScanimateConfig, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping
-    ) -> ImplicitAvatar:
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> ImplicitAvatar:
         if "neighbours" in facts["field"]:
             skinning = BodyField(template, facts["field"]["neighbours"])
         else:
@@ -177,9 +175,7 @@ class Scanimate(Method):
             skinning.load_state_dict(own)
         return ImplicitAvatar(template, skinning, torch.tensor(facts["box"]), settings.avatar)
 
-    def predictor(
-        self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
-    ) -> Callable[[BodyFit], Surface]:
+    def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
         check_count(points)
         avatar.outfit_index(outfit)
 

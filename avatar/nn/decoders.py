@@ -97,7 +97,7 @@ class TemplateNetwork(nn.Module):
     ``config`` has ``template``, ``normals`` and ``offset_scale``.
     """
 
-    outfit_modules = ("garment_encoder", "garment_decoder")  # see `nn.shared_norm.synchronize_norms`
+    outfit_modules = ("garment_encoder", "garment_decoder")  # see `nn.layers.synchronize_norms`
     scale_first = False  # whether offsets are scaled before their parts are added, which rounds otherwise
 
     def __init__(self, template: Template, config: Any):

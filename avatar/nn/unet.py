@@ -76,13 +76,12 @@ class UNet(nn.Module):
         for level, fan_out in enumerate([*reversed(widths), config.out_channels]):
             last = level == config.levels - 1
             norm = [] if last else [nn.BatchNorm2d(fan_out, affine=config.affine)]
-            self.ups.append(nn.Sequential(nn.ReLU(), *self._enlarge(level, fan_in, fan_out), *norm))
+            if level < config.levels - SMOOTH_LEVELS:
+                enlarge = [nn.ConvTranspose2d(fan_in, fan_out, 4, stride=2, padding=1, bias=False)]
+            else:
+                enlarge = [Doubling(), nn.Conv2d(fan_in, fan_out, 3, padding=1)]
+            self.ups.append(nn.Sequential(nn.ReLU(), *enlarge, *norm))
             fan_in = 2 * fan_out
-
-    def _enlarge(self, level: int, fan_in: int, fan_out: int) -> list[nn.Module]:
-        if level < self.config.levels - SMOOTH_LEVELS:
-            return [nn.ConvTranspose2d(fan_in, fan_out, 4, stride=2, padding=1, bias=False)]
-        return [Doubling(), nn.Conv2d(fan_in, fan_out, 3, padding=1)]
 
     def forward(self, image: Tensor) -> Tensor:
         """``(B, C, H, W)`` to ``(B, C', H, W)``; raises `AvatarError` unless both are multiples of ``2 ** levels``."""

@@ -8,7 +8,7 @@ import time
 from contextlib import nullcontext
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from avatar.checks import AvatarError, DataError
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Task
-from avatar.nn.shared_norm import synchronize_norms
+from avatar.nn.layers import synchronize_norms
 from avatar.progress import Progress
 from avatar.records import LossTerms
 from avatar.training.feeding import Feed, to_device
@@ -224,22 +224,16 @@ class Trainer:
             hint = "Train it anew under another name (name=...); finished weights are still read."
             raise DataError(folder, problem, hint)
         with restoring(folder):
-            self.restore(state)
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Restores a checkpoint's state."""
-        world = self.world
-        self.model.load_state_dict(state["model"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.stage, self.seconds = int(state["step"]), int(state["stage"]), float(state["seconds"])
-        before = (state["threads"], len(state["random"]))
-        if before != (torch.get_num_threads(), world.size):
-            report.info("Resuming with other threads or processes than before: equal to rounding, not to the bit.")
-        if len(state["random"]) == world.size:
-            random = state["random"][world.rank]
-            torch.set_rng_state(random["cpu"])
-            if "cuda" in random and self.device.type == "cuda":
-                torch.cuda.set_rng_state(random["cuda"], self.device)
+            self.model.load_state_dict(state["model"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.step, self.stage, self.seconds = int(state["step"]), int(state["stage"]), float(state["seconds"])
+            if (state["threads"], len(state["random"])) != (torch.get_num_threads(), world.size):
+                report.info("Resuming with other threads or processes than before: equal to rounding, not to the bit.")
+            if len(state["random"]) == world.size:
+                random = state["random"][world.rank]
+                torch.set_rng_state(random["cpu"])
+                if "cuda" in random and self.device.type == "cuda":
+                    torch.cuda.set_rng_state(random["cuda"], self.device)
 
 
 def spent(budget: Budget, steps: int, seconds: float) -> float:

@@ -28,7 +28,7 @@ from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import MeshConfig, mesh
 from avatar.records import LossTerms, Mesh, Surface
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
 from avatar.training.logs import read_log
 
