@@ -153,7 +153,7 @@ def _query(tree: Tree, queries: np.ndarray, k: int) -> Tensor:
 
 
 def _query_in_order(tree: Tree, other: Tree) -> Tensor:
-    """Indices ``(N,)`` of the nearest points of the other tree to this tree's points, asked in this tree's order."""
+    """Indices ``(N,)`` of the nearest points of the other tree to this tree's points, queried in this tree's order."""
     ids = torch.empty(tree.n, dtype=torch.long)
     ids[tree.indices] = torch.from_numpy(other.query(tree.data[tree.indices])[1])
     return ids

@@ -119,8 +119,7 @@ def paint(values: Tensor, grid: UVGrid) -> Tensor:
 def seam_edges(faces: Tensor, uv_faces: Tensor) -> Tensor:
     """Edges ``(E, 2)`` of a mesh along which its atlas is cut, vertex ids rising: where POP's features jump.
 
-    An edge is cut when the triangles at its sides have it at different places in the atlas. Borders of the mesh
-    itself are not seams.
+    The triangles at their sides have them at different places in the atlas. Borders of the mesh are not seams.
     """
     check_shape("uv_faces", uv_faces, "F 3", **check_shape("faces", faces, "F 3"))
     edges = torch.cat([faces[:, [i, (i + 1) % 3]] for i in range(3)])

@@ -101,10 +101,7 @@ class TrainedAvatar:
     seconds: float
 
     def outfit_index(self, name: str) -> int:
-        """Index of an outfit among those the avatar was trained on.
-
-        Raises `AvatarError` for an outfit it was not trained on, naming those it was.
-        """
+        """Index of an outfit among those the avatar was trained on; raises `AvatarError` for any other."""
         if name not in self.config.outfit:
             raise AvatarError(f"outfit: this avatar was trained on {', '.join(self.config.outfit)}, not on {name!r}.")
         return self.config.outfit.index(name)

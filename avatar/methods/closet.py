@@ -38,7 +38,7 @@ class Skinning(Enum):
     """Source of the skinning that poses the dressed surface from the canonical pose to a frame's."""
 
     body = "body"  # CloSET: the transform of the skin an offset starts from
-    learned = "learned"  # SCANimate: a canonicalizer's field, asked at the offset point itself
+    learned = "learned"  # SCANimate: a canonicalizer's field, evaluated at the offset point itself
 
 
 class PoseLocality(Enum):

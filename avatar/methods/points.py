@@ -64,15 +64,10 @@ class PointTask(Task):
         frames: int,
         validation: Callable[[], Iterable[Batch]] = tuple,
     ):
-        """Prepares training.
+        """Prepares training of a network that is called as ``model(batch, samples) -> Prediction``.
 
-        Args:
-            model: called as ``model(batch, samples) -> Prediction``, with its garment codes, if any, in ``codes``.
-            template: where template points are drawn.
-            config: points, rates, losses, precision.
-            batch_at: this rank's shard of a step's batch, which follows from the step alone.
-            frames: training frames there are.
-            validation: the held-back batches, the same in every process.
+        Its garment codes, if any, are in ``codes``. ``batch_at`` gives this rank's shard of a step's batch, which
+        follows from the step alone; ``frames`` is the number of training frames; ``validation`` gives the held-back batches of all ranks.
         """
         self.model, self.template, self.config = model, template, config
         self.batch_at, self.validation, self.frames, self.batch = batch_at, validation, frames, config.batch
@@ -84,7 +79,6 @@ class PointTask(Task):
         self.replicated = getattr(model, "outfit_modules", ())
 
     def inputs_at(self, step: int) -> tuple[Batch, SurfaceSamples]:
-        """The batch of a step and its template points."""
         return self.batch_at(step), self.samples_at(step)
 
     def held_back(self) -> Iterator[tuple[Batch, SurfaceSamples]]:

@@ -81,16 +81,7 @@ class ImplicitTask(Task):
         frames: CanonicalFrames,
         checks: CanonicalFrames | None = None,
     ):
-        """Prepares training.
-
-        Args:
-            model: the avatar.
-            body: ``(V, 3)`` canonical body vertices, about which the field is sampled as well.
-            config: budget and optimiser.
-            settings: points in space, weights of the terms, decay of the learning rate.
-            frames: training frames.
-            checks: held-back frames.
-        """
+        """Prepares training on ``frames``, with ``checks`` held back; ``body (V, 3)`` are canonical body vertices."""
         self.model, self.body, self.box = model, body, model.box.cpu()
         self.config, self.settings, self.data, self.checks = config, settings, frames, checks
         self.frames, self.batch = len(frames), config.batch

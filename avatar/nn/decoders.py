@@ -93,8 +93,8 @@ class TemplateNetwork(nn.Module):
 
     For one outfit or many, each a learned code. The garment branch does not see the pose, so it runs once an outfit in
     the batch, whatever the number of frames. Subclasses build ``codes (O, ...)``, ``garment_encoder``,
-    ``garment_decoder`` (with an explicit template, CloSET 3.2) and ``pose_decoder`` (unless without pose); their
-    ``config`` has ``template``, ``normals`` and ``offset_scale``.
+    ``garment_decoder`` (with an explicit template, CloSET 3.2) and ``pose_decoder`` (unless without pose), and have
+    ``garment_features(codes, samples)`` ``(O, N, C)`` and ``pose_features(batch, samples)`` ``(B, N, C)``.
     """
 
     outfit_modules = ("garment_encoder", "garment_decoder")  # see `nn.layers.synchronize_norms`
@@ -106,14 +106,6 @@ class TemplateNetwork(nn.Module):
         self.pose_decoder: ShapeDecoder | None = None
         self.register_buffer("vertices", template.vertices.clone(), persistent=False)
         self.register_buffer("skin_normals", vertex_normals(template.vertices, template.faces), persistent=False)
-
-    def garment_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
-        """Garment features ``(O, N, C)`` of each sample, of codes ``(O, ...)``."""
-        raise NotImplementedError
-
-    def pose_features(self, batch: Batch, samples: SurfaceSamples) -> Tensor:
-        """Features ``(B, N, C)`` of each sample that depend on its frame's pose."""
-        raise NotImplementedError
 
     def places(self, samples: SurfaceSamples) -> Tensor:
         """Coordinates ``(N, P)`` of each sample that the decoders see: its position on the template."""

@@ -1,4 +1,4 @@
-"""Being asked to stop: SIGINT, SIGTERM and SIGUSR1 are noted, and the work ends where its state can be saved."""
+"""Stop signals: SIGINT, SIGTERM and SIGUSR1 are noted, and the work ends where its state can be saved."""
 
 from __future__ import annotations
 

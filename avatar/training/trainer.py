@@ -101,7 +101,7 @@ class Trainer:
                     stop.leave(self.folder)
 
     def write(self, log: TrainingLog | None, split: str, values: dict[str, float]) -> None:
-        """Writes one row of the log, on the main rank and where there are values."""
+        """Writes one row of the log on the main rank."""
         if log and values:
             epoch = self.step * self.task.batch // self.task.frames
             log.write(split, self.step, epoch, self.seconds, values)
