@@ -24,8 +24,7 @@ from avatar.io.points import write_points
 from avatar.io.retargeting import move_body
 from avatar.methods.settings import RunConfig
 from avatar.records import Mesh, Motion, PointCloud, Scan, Surface
-from avatar.runs.loading import load_avatar
-from avatar.runs.training import train
+from avatar.runs.training import load_avatar, train
 
 __all__ = [
     "Avatar",

@@ -21,7 +21,7 @@ from avatar.methods.base import TrainedAvatar
 from avatar.pipeline.scores import floors_root, predictions_folder, read_all_scores, read_floors, run_outfits
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.records import PointCloud
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 
 MAX_ERROR = 0.05  # metres at the hot end of the error pictures
 

@@ -27,8 +27,8 @@ from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.settings import RunConfig
 from avatar.nn.decoders import Normals
-from avatar.runs.loading import load_avatar
 from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.training import load_avatar
 
 MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
 

@@ -27,7 +27,7 @@ from avatar.methods.base import TrainedAvatar
 from avatar.pipeline.scores import current_commit, run_outfits, variant_of
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 
 
 @dataclass

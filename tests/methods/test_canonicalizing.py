@@ -33,7 +33,6 @@ from avatar.methods.canonicalizer import (
     WeightSource,
     fit_latent,
     load_canonicalizer,
-    rate_factor,
 )
 from avatar.pipeline.canonicalization import canonicalize, canonicalizer_with, score_canonical_scans, weight_colors
 from avatar.runs.canonicalizing import canonicalize_frames, skinning_source, train_canonicalizer
@@ -124,7 +123,7 @@ def test_every_scan_is_seen_once_an_epoch_in_an_order_that_changes(tmp_path):
 
 
 def test_rates_fall_at_half_and_three_quarters():
-    assert [rate_factor(share, 0.1) for share in (0, 0.49, 0.5, 0.74, 0.75, 1)] == pytest.approx(
+    assert [CycleConfig(decay=0.1).rate_factor(0, share) for share in (0, 0.49, 0.5, 0.74, 0.75, 1)] == pytest.approx(
         [1, 1, 0.1, 0.1, 0.01, 0.01]
     )
 
