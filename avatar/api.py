@@ -15,8 +15,7 @@ from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.checks import AvatarError, check_shape
 from avatar.data.outfits import Outfit
 from avatar.environment import prepared_process
-from avatar.evaluation.comparison import Comparison
-from avatar.evaluation.metrics import find_metrics
+from avatar.evaluation.metrics import Comparison, find_metrics
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.meshes import write_mesh
@@ -25,8 +24,7 @@ from avatar.io.points import write_points
 from avatar.io.retargeting import move_body
 from avatar.methods.settings import RunConfig
 from avatar.records import Mesh, Motion, PointCloud, Scan, Surface
-from avatar.runs.loading import load_avatar
-from avatar.runs.training import train
+from avatar.runs.training import load_avatar, train
 
 __all__ = [
     "Avatar",

@@ -51,8 +51,8 @@ VERBS = {
     ),
     "fit": Verb(
         "fits an unseen outfit from one scan",
-        "avatar.runs.fitting:fit_outfit",
-        "avatar.runs.fitting:FitConfig",
+        "avatar.runs.training:fit_outfit",
+        "avatar.methods.settings:FitConfig",
         options="run dataset outfit frame name steps points data_root runs_root device",
     ),
     "predict": Verb(

@@ -1,6 +1,6 @@
 """Data-parallel processes under torchrun: ranks, shards of a batch, and the collectives that training needs.
 
-Gradients are averaged, the statistics of every normalisation are those of the whole batch (`nn.shared_norm`), and what
+Gradients are averaged, the statistics of every normalisation are those of the whole batch (`nn.layers`), and what
 is computed once an outfit is computed for all outfits of the step in every process; so a run gives the losses and
 gradients of one process with the same batch, to rounding (with noise on the input: in distribution). NCCL serves CUDA,
 gloo the CPU. torch is imported where it is needed, for every command asks for its world, and help needs no torch.

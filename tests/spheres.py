@@ -5,8 +5,8 @@ import trimesh
 
 from avatar.methods.closet import ClosetConfig
 from avatar.nn.decoders import DecoderConfig
+from avatar.nn.encoders import PointNet2Config
 from avatar.nn.hierarchy import HierarchyConfig
-from avatar.nn.pointnet2 import PointNet2Config
 from avatar.records import Batch, Template
 
 

@@ -25,11 +25,10 @@ from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.motions import write_motion
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, CanonicalizerTask, CycleConfig
-from avatar.methods.settings import MethodChoice, RunConfig, Space
+from avatar.methods.settings import FitConfig, MethodChoice, RunConfig, Space
 from avatar.pipeline.canonicalization import canonicalize
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
-from avatar.runs.fitting import FitConfig, fit_outfit
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import fit_outfit, load_avatar
 from avatar.runs.training import train as train_run
 from avatar.simulate.sequences import authored_motion
 

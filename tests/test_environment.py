@@ -12,8 +12,8 @@ import pytest
 from avatar.environment import inspect_package, install_hint
 from avatar.invocation import interpreter
 from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
-from avatar.runs.fitting import fit_outfit
 from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.training import fit_outfit
 from avatar.runs.training import train as train_run
 from avatar.verbs import VERBS, resolve
 from benchmarks import BENCH

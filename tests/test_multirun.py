@@ -99,7 +99,7 @@ def test_a_job_that_died_is_named_as_well(tmp_path):
     note_outcome(tmp_path, 1, "train outfit=two", State.running)
     note_outcome(tmp_path, 2, "train outfit=three", State.stopped, "SIGTERM")
     told = summarise(read_outcomes(tmp_path))
-    assert told.startswith("3 jobs: 1 without a word of their end, 1 finished, 1 stopped.")
+    assert told.startswith("3 jobs: 1 crashed or still running, 1 finished, 1 stopped.")
     assert f"running: train outfit=two: process {os.getpid()} on" in told
     assert "outfit=one" not in told
     assert summarise(read_outcomes(tmp_path)[:1]) == "1 jobs: 1 finished."

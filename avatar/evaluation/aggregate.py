@@ -1,10 +1,10 @@
-"""What is said of many scores: means over frames, the worst outfit, and how sure a difference between methods is."""
+"""Statistics of scores: means over seeds and frames, the worst outfit, bootstrap intervals of differences."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,15 @@ from avatar.evaluation.metrics import find_metrics
 from avatar.evaluation.scores import FrameScore, Score
 
 FLOORS = ("sampling", "body", "static")
+
+
+class Place(NamedTuple):
+    """What a number in a table is of; ``fraction`` of the training frames only where methods are not named by it."""
+
+    method: str
+    outfit: str
+    metric: str
+    fraction: str = ""
 
 
 @dataclass(frozen=True)
@@ -36,13 +45,18 @@ class Interval:
 
     def written(self, scale: float) -> str:
         """The difference and its interval as printed, in units ``1 / scale`` of the metric's."""
-        values = (self.difference * scale, self.low * scale, self.high * scale)
-        return "{:+.3f} [{:+.3f}, {:+.3f}]".format(*values)
+        return f"{self.difference * scale:+.3f} [{self.low * scale:+.3f}, {self.high * scale:+.3f}]"
+
+
+def named(method: str, *parts: str) -> str:
+    """A method with what tells it apart in brackets, if there is anything."""
+    parts = tuple(filter(None, parts))
+    return f"{method} ({', '.join(parts)})" if parts else method
 
 
 def method_key(row: Score | FrameScore) -> str:
-    """How a method is named in tables: with its variant in brackets, if it has one."""
-    return f"{row.method} ({row.variant})" if row.variant else row.method
+    """A method's name in tables, with its variant."""
+    return named(row.method, row.variant)
 
 
 def base_method(method: str) -> str:
@@ -50,10 +64,54 @@ def base_method(method: str) -> str:
     return method.split(" (")[0]
 
 
+def floor_rank(method: str) -> int:
+    """Floors come first, in their order."""
+    return (*FLOORS, base_method(method)).index(base_method(method))
+
+
 def order_methods(methods: Iterable[str]) -> list[str]:
     """Floors first, in their order, then the methods by name."""
-    rank = {floor: place for place, floor in enumerate(FLOORS)}
-    return sorted(methods, key=lambda method: (rank.get(base_method(method), len(FLOORS)), method))
+    return sorted(methods, key=lambda method: (floor_rank(method), method))
+
+
+def find_counterpart(method: str, methods: Iterable[str], base: str) -> str | None:
+    """Which variant of a base method another one is set against: that of its own variant, or the only one."""
+    candidates = [other for other in methods if base_method(other) == base]
+    own = base + method.removeprefix(base_method(method))
+    return own if own in candidates else candidates[0] if len(candidates) == 1 else None
+
+
+def grouped(rows: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list]:
+    """Rows by key, both in their order of appearance."""
+    groups: dict[Any, list] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+def average_seeds(rows: Iterable[Score], by_fraction: bool = False) -> dict[Place, Cell]:
+    """Means over training seeds, in the metrics' units; ``by_fraction`` keeps the share of frames out of the names.
+
+    Raises:
+        AvatarError: for two rows of one seed for the same number.
+    """
+
+    def place_of(row: Score) -> Place:
+        share = f"{100 * row.fraction:g}%" if by_fraction else ""
+        method = named(row.method, *(part for part in row.variant.split(", ") if part != share))
+        return Place(method, row.outfit, row.metric, share)
+
+    cells = {}
+    for place, mine in grouped(rows, place_of).items():
+        seeds = [row.seed for row in mine]
+        if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
+            raise AvatarError(
+                f"rows: two scores of {place.metric} for {place.method} on {place.outfit}, seed {twice[0]}; keep one, "
+                "or tell them apart by variant."
+            )
+        value, points = np.mean([(row.value, row.points) for row in mine], axis=0)
+        cells[place] = Cell(float(value), max(row.frames for row in mine), round(float(points)))
+    return cells
 
 
 def tabulate(rows: Iterable[Score], metric: str) -> dict[str, dict[str, Cell]]:
@@ -62,83 +120,52 @@ def tabulate(rows: Iterable[Score], metric: str) -> dict[str, dict[str, Cell]]:
     Raises:
         AvatarError: for an unknown metric, one that nobody scored, or two rows for the same number.
     """
-    (known,) = find_metrics([metric])
-    found: dict[str, dict[str, dict[int, Score]]] = defaultdict(lambda: defaultdict(dict))
-    for row in rows:
-        if row.metric != known.name:
-            continue
-        seeds = found[row.outfit][method_key(row)]
-        if row.seed in seeds:
-            raise AvatarError(
-                f"rows: two scores of {known.name} for {method_key(row)} on {row.outfit}, seed {row.seed}; "
-                "keep one, or tell them apart by variant."
-            )
-        seeds[row.seed] = row
-    if not found:
-        raise AvatarError(f"rows: no score of {known.name} among them.")
-    return {
-        outfit: {
-            method: Cell(
-                float(np.mean([s.value for s in seeds.values()])),
-                max(s.frames for s in seeds.values()),
-                round(float(np.mean([s.points for s in seeds.values()]))),
-            )
-            for method, seeds in methods.items()
-        }
-        for outfit, methods in sorted(found.items())
-    }
+    find_metrics([metric])
+    cells = average_seeds(row for row in rows if row.metric == metric)
+    if not cells:
+        raise AvatarError(f"rows: no score of {metric} among them.")
+    grid: dict[str, dict[str, Cell]] = {outfit: {} for outfit in sorted({place.outfit for place in cells})}
+    for place, cell in cells.items():
+        grid[place.outfit][place.method] = cell
+    return grid
 
 
-def frame_weighted_mean(cells: Iterable[Cell]) -> float:
+def frame_weighted_mean(cells: Sequence[Cell | Score]) -> float:
     """The mean over all frames of all outfits: each outfit's mean counts as often as it has frames."""
-    cells = list(cells)
     return float(np.average([cell.value for cell in cells], weights=[cell.frames for cell in cells]))
 
 
 def worst_outfit(cells: Iterable[Cell], higher_is_better: bool = False) -> float:
     """The maximum over outfits of the per-outfit mean (the minimum, where higher is better)."""
-    values = [cell.value for cell in cells]
-    return min(values) if higher_is_better else max(values)
+    return (min if higher_is_better else max)(cell.value for cell in cells)
 
 
-def bootstrap_difference(
-    frames: Iterable[FrameScore],
-    metric: str,
-    first: str,
-    second: str,
-    resamples: int = 2000,
-    confidence: float = 0.95,
-    seed: int = 0,
-) -> Interval:
-    """Percentile bootstrap of the frame-weighted mean difference of two methods over the frames both have.
-
-    Frames are paired and redrawn within their outfit. They count as independent: true of settled poses; neighbours
-    in a motion are alike, and the interval is then too narrow.
+def paired_differences(frames: Iterable[FrameScore], metric: str, first: str, second: str) -> dict[str, list[float]]:
+    """``first - second`` on every frame that both methods have, by outfit; seeds are averaged.
 
     Args:
-        frames: single-frame scores. first, second: methods as `method_key` names them.
-
-    Raises:
-        AvatarError: when the two methods have no frame in common.
+        frames: single-frame scores.
+        metric: its name.
+        first, second: methods as `method_key` names them.
     """
-    find_metrics([metric])
-    values: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in frames:
-        if row.metric == metric and method_key(row) in (first, second):
-            values[row.outfit, row.frame][method_key(row)].append(row.value)
-    outfits: dict[str, list[float]] = defaultdict(list)
-    for (outfit, _), pair in values.items():
-        if first in pair and second in pair:
-            outfits[outfit].append(float(np.mean(pair[first]) - np.mean(pair[second])))
-    if not outfits:
-        raise AvatarError(f"frames: {first} and {second} have no frame of {metric} in common.")
-    return bootstrap_mean(outfits.values(), resamples, confidence, seed)
+    mine = (row for row in frames if row.metric == metric and method_key(row) in (first, second))
+    differences: dict[str, list[float]] = {}
+    for (outfit, _), rows in grouped(mine, lambda row: (row.outfit, row.frame)).items():
+        values = grouped(rows, method_key)
+        if len(values) == 2:
+            means = [float(np.mean([row.value for row in values[method]])) for method in (first, second)]
+            differences.setdefault(outfit, []).append(means[0] - means[1])
+    return differences
 
 
 def bootstrap_mean(
     groups: Iterable[Sequence[float]], resamples: int = 2000, confidence: float = 0.95, seed: int = 0
 ) -> Interval:
-    """The mean of all values with its percentile bootstrap interval; values are redrawn within their group."""
+    """The mean of all values with its percentile bootstrap interval; values are redrawn within their group.
+
+    They count as independent: true of settled poses; neighbours in a motion are alike, and the interval is then too
+    narrow.
+    """
     groups = [np.asarray(values, np.float64) for values in groups]
     count = sum(map(len, groups))
     generator, sums = np.random.default_rng(seed), np.zeros(resamples)

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from avatar.checks import AvatarError, check_shape
+from avatar.data.outfits import Outfit
 from avatar.evaluation.aggregate import method_key
 from avatar.evaluation.canonical_truth import (
     APART,
@@ -24,10 +25,10 @@ from avatar.evaluation.canonical_truth import (
     unpose_truly,
 )
 from avatar.evaluation.closest import closest_on_mesh
-from avatar.evaluation.metrics import Metric
+from avatar.evaluation.metrics import CENTIMETRES, PERCENT, Metric
 from avatar.evaluation.scores import FrameScore, Score, Scores
-from avatar.evaluation.scoring import Label, Outfit, mean_scores, remember
-from avatar.evaluation.tables import Table, TableRow
+from avatar.evaluation.scoring import Label, mean_scores, remember
+from avatar.evaluation.tables import Table, tabulate_metrics
 from avatar.io.ledger import Ledger
 from avatar.progress import tracked
 from avatar.records import Frame, Mesh, Template
@@ -77,7 +78,7 @@ class CanonicalComparison:
 
     @cached_property
     def off_cycle(self) -> np.ndarray:
-        """Distance of each point to itself when carried back with the weights of where it is, ``(N,)``; else empty."""
+        """Distance of each point to itself when reposed with the weights of where it is, ``(N,)``; else empty."""
         scan, weights = self.result.scan, self.result.forward_weights
         if weights is None:
             return np.empty(0)
@@ -135,9 +136,7 @@ def _over(part: str, errors: str, reduce: Callable[[np.ndarray], float], scale: 
 
     def measure(comparison: CanonicalComparison) -> float:
         values = getattr(comparison, errors)
-        if not len(values):
-            return np.nan
-        values = values[comparison.part(part)]
+        values = values[comparison.part(part)] if len(values) else values
         values = values[np.isfinite(values)]
         return scale * float(reduce(values)) if len(values) else np.nan
 
@@ -149,54 +148,30 @@ def _part_metrics(part: str) -> list[Metric]:
     end, whom = "" if part == "all" else f"_{part}", PARTS[part]
     truth = f"distance of canonical points to their true places on the clothes and skin at rest, {whom}."
     cycle = f"distance of points to themselves when reposed with the weights at their canonical places, {whom}."
-    rows = (
-        ("truth", "off_truth", "cm", f"Mean {truth}", np.mean),
-        ("truth_median", "off_truth", "cm", f"Median {truth}", np.median),
-        ("truth_p95", "off_truth", "cm", f"95th percentile of the {truth}", lambda values: np.quantile(values, 0.95)),
-        ("cycle", "off_cycle", "cm", f"Cycle error: mean {cycle}", np.mean),
-        (
-            "surface",
-            "off_surface",
-            "cm",
-            f"Mean distance to the true surface of the same label, {whom}.",
-            np.mean,
-        ),
-        (
-            "weights",
-            "off_weights",
-            "1",
-            f"Share of skinning weight on other than the true joints, {whom}.",
-            np.mean,
-        ),
+    distances = (
+        ("truth", "off_truth", f"Mean {truth}", np.mean),
+        ("truth_median", "off_truth", f"Median {truth}", np.median),
+        ("truth_p95", "off_truth", f"95th percentile of the {truth}", lambda values: np.quantile(values, 0.95)),
+        ("cycle", "off_cycle", f"Cycle error: mean {cycle}", np.mean),
+        ("surface", "off_surface", f"Mean distance to the true surface of the same label, {whom}.", np.mean),
     )
-    return [
-        Metric(
-            f"{name}{end}" + ("_cm" if unit == "cm" else ""),
-            unit,
-            1 if unit == "cm" else 100,
-            "cm" if unit == "cm" else "%",
-            definition,
-            _over(part, errors, reduce, 100 if unit == "cm" else 1),
-        )
-        for name, errors, unit, definition, reduce in rows
+    metrics = [
+        Metric(f"{name}{end}_cm", *CENTIMETRES, definition, _over(part, errors, reduce, 100))
+        for name, errors, definition, reduce in distances
     ]
+    share = f"Share of skinning weight on other than the true joints, {whom}."
+    return [*metrics, Metric(f"weights{end}", *PERCENT, share, _over(part, "off_weights", np.mean, 1))]
 
 
 OVERVIEW = ("cycle_cm", "cycle_garment_cm", "truth_garment_cm", "truth_contact_cm", "triangles_cut")
+CONTACT_SHARE = "Share of scan points in contact, of the scan as it came."
 CANONICAL_METRICS: dict[str, Metric] = {
     metric.name: metric
     for metric in (
         *(metric for part in PARTS for metric in _part_metrics(part)),
-        Metric("points_lost", "1", 100, "%", "Share of scan points that were cut away.", lambda c: c.lost),
-        Metric("triangles_cut", "1", 100, "%", "Share of triangles that were cut as stretched.", lambda c: c.cut),
-        Metric(
-            "contact_share",
-            "1",
-            100,
-            "%",
-            "Share of scan points in contact, of the scan as it came.",
-            lambda c: c.truth.contact.mean(),
-        ),
+        Metric("points_lost", *PERCENT, "Share of scan points that were cut away.", lambda c: c.lost),
+        Metric("triangles_cut", *PERCENT, "Share of triangles that were cut as stretched.", lambda c: c.cut),
+        Metric("contact_share", *PERCENT, CONTACT_SHARE, lambda c: c.truth.contact.mean()),
     )
 }
 
@@ -237,6 +212,7 @@ def score_canonicalization(
     }
     surfaces = canonical_surfaces(outfit, split, names[0])
     frames: list[FrameScore] = []
+    found: dict[Label, list[FrameScore]] = {label: [] for label in labels}
     counts: dict[Label, list[int]] = {label: [] for label in labels}
     for name in tracked(names, f"score canonical scans of {outfit.name}"):
         known = {label: memory.recall(name, CANONICAL_METRICS) for label, memory in memories.items()}
@@ -249,8 +225,13 @@ def score_canonicalization(
             memories[label].note(name, *measured)
         for label, (values, points) in (known | new).items():
             counts[label].append(points)
-            frames += _frame_scores(values, outfit.name, name, label)
-    rows = [row for label in labels for row in _mean_rows(frames, label, round(float(np.mean(counts[label]))))]
+            where = (outfit.name, label.method, label.variant, label.seed, name)
+            mine = [FrameScore(*where, metric, value) for metric, value in values.items() if np.isfinite(value)]
+            found[label] += mine
+            frames += mine
+    rows = []
+    for label, mine in found.items():
+        rows += mean_scores(mine, CANONICAL_METRICS.values(), label, "", round(float(np.mean(counts[label]))))
     return Scores(rows, frames)
 
 
@@ -272,27 +253,12 @@ def _measure_frame(
 ) -> dict[Label, tuple[dict[str, float], int]]:
     """Every metric of a frame, NaN where it does not have one, and the point count, for each method; None is `TRUE`."""
     truth, found = frame_truth(frame.scan, template), {}
-    for label, carry in methods.items():
-        result = unpose_truly(frame, truth, template) if carry is None else carry(frame)
+    for label, canonicalize in methods.items():
+        result = unpose_truly(frame, truth, template) if canonicalize is None else canonicalize(frame)
         comparison = CanonicalComparison(frame, truth, result, template, surfaces)
         values = {name: float(metric.measure(comparison)) for name, metric in CANONICAL_METRICS.items()}
         found[label] = values, len(result.scan.points)
     return found
-
-
-def _frame_scores(values: Mapping[str, float], outfit: str, frame: str, label: Label) -> list[FrameScore]:
-    """The metrics that a frame has."""
-    return [
-        FrameScore(outfit, label.method, label.variant, label.seed, frame, metric, value)
-        for metric, value in values.items()
-        if np.isfinite(value)
-    ]
-
-
-def _mean_rows(frames: list[FrameScore], label: Label, points: int) -> list[Score]:
-    """Means over the frames that have each metric, for one method."""
-    mine = [f for f in frames if (f.method, f.variant, f.seed) == (label.method, label.variant, label.seed)]
-    return mean_scores(mine, CANONICAL_METRICS.values(), label, "", points)
 
 
 def canonical_table(rows: Sequence[Score], outfit: str, metrics: Sequence[str] = tuple(CANONICAL_METRICS)) -> Table:
@@ -301,23 +267,11 @@ def canonical_table(rows: Sequence[Score], outfit: str, metrics: Sequence[str] =
     Raises:
         AvatarError: for unknown metrics, or an outfit that nobody scored.
     """
-    unknown = [name for name in metrics if name not in CANONICAL_METRICS]
-    mine = [row for row in rows if row.outfit == outfit and row.metric in metrics]
-    if unknown or not mine:
-        what = f"metrics: unknown {', '.join(unknown)}" if unknown else f"outfit: nobody scored {outfit!r}"
-        raise AvatarError(f"{what}; there are {', '.join(CANONICAL_METRICS)}.")
-    values = {(row.metric, method_key(row)): row.value for row in mine}
-    methods = sorted({method for _, method in values}, key=lambda method: (method != TRUE, method))
-    scored = [CANONICAL_METRICS[name] for name in metrics if any((name, method) in values for method in methods)]
-    body = tuple(
-        TableRow(
-            f"{m.name} ({m.shown_in})",
-            tuple(values[m.name, k] * m.scale if (m.name, k) in values else None for k in methods),
-        )
-        for m in scored
-    )
-    notes = (*(f"{m.name}: {m.definition}" for m in scored), TRUE_NOTE)
-    return Table(outfit, "metric", tuple(methods), body, notes)
+    if unknown := [name for name in metrics if name not in CANONICAL_METRICS]:
+        raise AvatarError(f"metrics: unknown {', '.join(unknown)}; there are {', '.join(CANONICAL_METRICS)}.")
+    last = {(row.outfit, method_key(row), row.metric): row for row in rows}  # several runs score the same baselines
+    table = tabulate_metrics(list(last.values()), outfit, [CANONICAL_METRICS[name] for name in metrics], TRUE)
+    return replace(table, notes=(*table.notes, TRUE_NOTE))
 
 
 def canonical_overview(rows: Sequence[Score], metrics: Sequence[str] = OVERVIEW) -> Table:

@@ -1,9 +1,7 @@
-"""Scores of canonicalizations against what only a simulator knows: where on the garment every scan point really is.
+"""The truth of canonicalizations, which only a simulator knows: where on the garment every scan point really is.
 
-A canonicalization carries a posed scan to the canonical pose. Papers could only look at it, or at avatars learned from
-it; here each canonical point has a true place. What the cloth itself does between the two poses is in that error as
-well, the same for every method. Two references say how much: each point carried by the weights of the body under its
-true place, and by the fixed weights that explain its motion best (`best_skinning`).
+What the cloth itself does between the two poses is in the error as well, the same for every method. A reference says
+how much: each point unposed with the weights of the body under its true place.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ class Canonicalized:
     """What a method made of one frame: its canonical ``scan``, and the weights it gives to points where they are now.
 
     ``forward_weights (M, J)`` are evaluated at the canonical points (the forward field g^c, or the weights of the
-    nearest vertices of the body at rest); they carry the scan back to its pose, and tell whether the cycle closes.
+    nearest vertices of the body at rest); they pose the scan again, and tell whether the cycle closes.
     """
 
     scan: CanonicalScan
@@ -98,7 +96,7 @@ def weights_under(canonical: np.ndarray, template: Template) -> np.ndarray:
 
 
 def repose(points: np.ndarray, weights: np.ndarray, body: BodyFit, template: Template) -> np.ndarray:
-    """Canonical points ``(M, 3)`` with weights ``(M, J)`` carried to a body's pose, ``(M, 3)``."""
+    """Canonical points ``(M, 3)`` with weights ``(M, J)`` skinned to a body's pose, ``(M, 3)``."""
     return transform_points(_posed_from_canonical(weights, body, template), torch.from_numpy(points)).numpy()
 
 
@@ -119,8 +117,8 @@ def unpose_with(weights: np.ndarray, frame: Frame, template: Template) -> Canoni
 
 def unpose_truly(frame: Frame, truth: FrameTruth, template: Template) -> Canonicalized:
     """The canonicalization with the weights of the body under each point's true place."""
-    carried = unpose_with(truth.weights, frame, template)
-    return Canonicalized(carried, weights_under(carried.points, template))
+    scan = unpose_with(truth.weights, frame, template)
+    return Canonicalized(scan, weights_under(scan.points, template))
 
 
 def _posed_from_canonical(weights: np.ndarray, body: BodyFit, template: Template) -> torch.Tensor:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 
 from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.trees import build_tree
 
 FIRST_CANDIDATES = 8  # triangles tried for each query before asking whether a farther one could be closer
-CHUNK_PAIRS = 1 << 20  # query-triangle pairs held at once: about 0.3 GB of temporaries
+CHUNK_PAIRS = 1 << 17  # query-triangle pairs compared at once: what fits a processor's cache is fastest
 
 
 @dataclass(frozen=True)
@@ -30,10 +31,8 @@ def closest_on_mesh(
 ) -> SurfaceHits:
     """The closest surface point to each query, exactly, and the side of the surface the query is on.
 
-    Triangles are tried in the order of their pieces' distance, in lists that grow until no piece left out could be
-    closer (its centre is too far away for its size). The sign is that of the angle-weighted
-    pseudo-normal (Baerentzen and Aanaes 2005), which is right for every closed, consistently wound mesh, also where
-    the closest point is an edge or a vertex.
+    The sign is that of the angle-weighted pseudo-normal (Baerentzen and Aanaes 2005), which is right for every closed,
+    consistently wound mesh, also where the closest point is an edge or a vertex.
 
     Args:
         queries: ``(N, 3)`` metres.
@@ -52,94 +51,41 @@ def closest_on_mesh(
     queries, vertices = np.asarray(queries, np.float64), np.asarray(vertices, np.float64)
     check_finite("queries", queries)
     check_finite("vertices", vertices)
-    search = _TriangleSearch(vertices[faces])
-    face_ids = search.closest(queries, exact_within)
-    points, weights = closest_on_triangles(queries, search.corners[face_ids])
-    normals = _pseudo_normals(vertices, faces, face_ids, weights)
+    face_ids = _closest_faces(queries, vertices, np.asarray(faces), exact_within)
+    points, weights = closest_on_triangles(queries, vertices[faces[face_ids]])
     away = queries - points
+    normals = _pseudo_normals(trimesh.Trimesh(vertices, faces, process=False), face_ids, weights)
     sides = np.where((away * normals).sum(axis=1) < 0, -1.0, 1.0)
     return SurfaceHits(points, face_ids, sides * np.linalg.norm(away, axis=1))
 
 
-class _TriangleSearch:
-    """A KD-tree over small pieces of triangles: prepare once, query many."""
+def _closest_faces(queries: np.ndarray, vertices: np.ndarray, faces: np.ndarray, exact_within: float) -> np.ndarray:
+    """The closest triangle of each query ``(N,)``: candidates by the distance of their pieces' centres.
 
-    def __init__(self, corners: np.ndarray):
-        centres, self.owners, self.reach = _cover(corners)
-        self.corners, self.tree = corners, build_tree(centres)
-        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        self.frames = np.concatenate([corners[:, 0], first, second], axis=1)
-        dots = [(u * v).sum(axis=1) for u, v in ((first, first), (first, second), (second, second))]
-        self.dots = np.stack(dots, axis=1)
-
-    def closest(self, queries: np.ndarray, exact_within: float) -> np.ndarray:
-        """The closest triangle of each query ``(N,)``, in rounds of growing candidate lists."""
-        face_ids = np.empty(len(queries), np.int64)
-        open_ids, k = np.arange(len(queries)), FIRST_CANDIDATES
-        while len(open_ids):
-            k = min(k, self.tree.n)
-            unsure = []
-            for ids in np.array_split(open_ids, len(open_ids) * k // CHUNK_PAIRS + 1):
-                radii, found = self.tree.query(queries[ids], k=np.arange(1, k + 1), workers=-1)
-                candidates = self.owners[found]
-                squared = self._squared_distances(queries[ids], candidates)
-                best = squared.argmin(axis=1)
-                rows = np.arange(len(ids))
-                face_ids[ids] = candidates[rows, best]
-                distances = np.sqrt(squared[rows, best])
-                unsure.append(ids[(distances > radii[:, -1] - self.reach) & (distances <= exact_within)])
-            open_ids = np.concatenate(unsure) if k < self.tree.n else open_ids[:0]
-            k *= 3
-        return face_ids
-
-    def _squared_distances(self, queries: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-        """Squared distance of each query to each of its candidate triangles ``(N, k)``, from dot products alone.
-
-        A triangle is a + s u + t v, and the squared distance a quadratic in (s, t): its minimum is the plane's, or
-        that of one of the three edges.
-        """
-        frames = self.frames[candidates]
-        away = queries[:, None] - frames[..., :3]
-        square = np.einsum("nki,nki->nk", away, away)
-        along_u = np.einsum("nki,nki->nk", away, frames[..., 3:6])
-        along_v = np.einsum("nki,nki->nk", away, frames[..., 6:])
-        uu, uv, vv = np.moveaxis(self.dots[candidates], -1, 0)
-
-        def at(s: np.ndarray, t: np.ndarray) -> np.ndarray:
-            return square + s * (s * uu + 2 * t * uv - 2 * along_u) + t * (t * vv - 2 * along_v)
-
-        tiny = np.finfo(np.float64).tiny
-        zero = np.zeros_like(square)
-        s, t = np.clip(along_u / np.maximum(uu, tiny), 0, 1), np.clip(along_v / np.maximum(vv, tiny), 0, 1)
-        across = np.clip((along_v - along_u + uu - uv) / np.maximum(uu - 2 * uv + vv, tiny), 0, 1)
-        best = np.minimum(np.minimum(at(s, zero), at(zero, t)), at(1 - across, across))
-        area = np.maximum(uu * vv - uv * uv, tiny)
-        s, t = (vv * along_u - uv * along_v) / area, (uu * along_v - uv * along_u) / area
-        inside = (s > 0) & (t > 0) & (s + t < 1)
-        return np.maximum(np.where(inside, np.minimum(best, at(s, t)), best), 0)
-
-
-def _cover(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Balls that cover the triangles: centres ``(P, 3)``, the triangle of each ``(P,)`` and their common radius.
-
-    Long triangles are halved across their longest edge until all pieces are about as small as the average one:
-    with one ball a triangle, a single long one would make every search wide.
+    Lists of candidates grow until no piece left out could be closer: its centre is too far away for its size. Long
+    triangles are cut into pieces about as small as the average one, for a single long one would make every search wide.
     """
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    radius = 0.7 * np.sqrt(np.linalg.norm(crosses, axis=1).mean() / 2) + np.ptp(corners) * 1e-3
-    pieces, owners, done = corners, np.arange(len(corners)), []
-    while len(pieces):
-        centres = pieces.mean(axis=1)
-        small = np.linalg.norm(pieces - centres[:, None], axis=2).max(axis=1) <= radius
-        done.append((centres[small], owners[small]))
-        pieces, owners = pieces[~small], owners[~small]
-        longest = np.linalg.norm(np.roll(pieces, -1, axis=1) - pieces, axis=2).argmax(axis=1)
-        turned = pieces[np.arange(len(pieces))[:, None], (longest[:, None] + np.arange(3)) % 3]
-        middle = turned[:, :2].mean(axis=1)
-        halves = (turned[:, 0], middle, turned[:, 2]), (middle, turned[:, 1], turned[:, 2])
-        pieces = np.concatenate([np.stack(half, axis=1) for half in halves])
-        owners = np.concatenate([owners, owners])
-    return np.concatenate([c for c, _ in done]), np.concatenate([o for _, o in done]), float(radius)
+    corners = vertices[faces]
+    areas = trimesh.triangles.area(corners)
+    longest = 1.6 * np.sqrt(areas.mean()) + np.ptp(corners) * 1e-3
+    places, pieces, owners = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=20, return_index=True)
+    centres = places[pieces].mean(axis=1)
+    reach = np.linalg.norm(places[pieces] - centres[:, None], axis=2).max()
+    tree = build_tree(centres)
+    face_ids, remaining, k = np.empty(len(queries), np.int64), np.arange(len(queries)), FIRST_CANDIDATES
+    while len(remaining):
+        k, unsure = min(k, tree.n), []
+        for ids in np.array_split(remaining, len(remaining) * k // CHUNK_PAIRS + 1):
+            radii, found = tree.query(queries[ids], k=np.arange(1, k + 1), workers=-1)
+            candidates = owners[found]
+            squared, _ = _candidates(np.repeat(queries[ids], k, axis=0), corners[candidates.ravel()])
+            squared = np.minimum.reduce(squared).reshape(-1, k)
+            face_ids[ids] = candidates[np.arange(len(ids)), squared.argmin(axis=1)]
+            nearest = np.sqrt(np.maximum(squared.min(axis=1), 0))
+            unsure.append(ids[(nearest > radii[:, -1] - reach) & (nearest <= exact_within)])
+        remaining = np.concatenate(unsure) if k < tree.n else remaining[:0]
+        k *= 3
+    return face_ids
 
 
 def closest_on_triangles(queries: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,58 +93,42 @@ def closest_on_triangles(queries: np.ndarray, corners: np.ndarray) -> tuple[np.n
 
     Weights are barycentric; those of a point on an edge or at a corner are exactly zero elsewhere.
     """
-    best_points, best_weights = np.empty_like(queries), np.zeros_like(queries)
-    best = np.full(len(queries), np.inf)
-    for start, end in ((0, 1), (1, 2), (2, 0)):
-        edge = corners[:, end] - corners[:, start]
-        length = np.maximum((edge * edge).sum(axis=1), np.finfo(np.float64).tiny)
-        along = np.clip(((queries - corners[:, start]) * edge).sum(axis=1) / length, 0.0, 1.0)
-        points = corners[:, start] + along[:, None] * edge
-        gaps = np.square(queries - points).sum(axis=1)
-        closer = gaps < best
-        best[closer], best_points[closer] = gaps[closer], points[closer]
-        best_weights[closer] = 0.0
-        best_weights[closer, start], best_weights[closer, end] = 1 - along[closer], along[closer]
-    inner = _barycentric(queries, corners)
-    inside = (inner > 0).all(axis=1)
-    best_weights[inside] = inner[inside]
-    best_points[inside] = (inner[inside, :, None] * corners[inside]).sum(axis=1)
-    return best_points, best_weights
+    squared, weights = _candidates(queries, corners)
+    best = np.array(weights)[np.argmin(squared, axis=0), :, np.arange(len(queries))]
+    return np.einsum("ni,nij->nj", best, corners), best
 
 
-def _barycentric(queries: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Barycentric weights of the queries' projections to the triangles' planes; NaN for triangles without area."""
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normals = np.cross(first, second)
-    away = queries - corners[:, 0]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        areas = (normals * normals).sum(axis=1)
-        beta = (np.cross(away, second) * normals).sum(axis=1) / areas
-        gamma = (np.cross(first, away) * normals).sum(axis=1) / areas
-    return np.stack([1 - beta - gamma, beta, gamma], axis=1)
+def _candidates(queries: np.ndarray, corners: np.ndarray) -> tuple[list, list]:
+    """Squared distances ``(N,)`` to the closest points inside triangles and on their edges, with barycentric weights.
+
+    A triangle is a + s u + t v, and the squared distance a quadratic in (s, t), from dot products alone. Inside comes
+    first, infinitely far where the plane's minimum is not inside.
+    """
+    first, second, away = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], queries - corners[:, 0]
+    products = ((first, first), (first, second), (second, second), (away, first), (away, second), (away, away))
+    uu, uv, vv, au, av, aa = (np.einsum("ni,ni->n", *pair) for pair in products)
+    tiny, zero = np.finfo(np.float64).tiny, np.zeros(len(queries))
+    area = uu * vv - uv * uv
+    area = np.where(area > 0, area, np.inf)  # of a triangle without area the edges are all there is
+    s, t = (vv * au - uv * av) / area, (uu * av - uv * au) / area
+    inside = (s > 0) & (t > 0) & (s + t < 1)
+    s, t = s * inside, t * inside
+    on_first, on_second = np.clip(au / np.maximum(uu, tiny), 0, 1), np.clip(av / np.maximum(vv, tiny), 0, 1)
+    on_third = np.clip((av - au + uu - uv) / np.maximum(uu - 2 * uv + vv, tiny), 0, 1)
+    weights = [(1 - s - t, s, t), (1 - on_first, on_first, zero), (1 - on_second, zero, on_second)]
+    weights.append((zero, 1 - on_third, on_third))
+    squared = [aa + s * (s * uu + 2 * t * uv - 2 * au) + t * (t * vv - 2 * av) for _, s, t in weights]
+    squared[0] = np.where(inside, np.minimum.reduce(squared), np.inf)
+    return squared, weights
 
 
-def _pseudo_normals(vertices: np.ndarray, faces: np.ndarray, face_ids: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Unnormalised pseudo-normals where closest points lie: of the face, of the edge or of the corner."""
-    corners = vertices[faces]
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    units = crosses / np.maximum(np.linalg.norm(crosses, axis=1, keepdims=True), 1e-30)
-    at_vertices, at_edges = np.zeros_like(vertices), np.zeros((len(faces), 3, 3))
-    for corner in range(3):
-        after = corners[:, (corner + 1) % 3] - corners[:, corner]
-        before = corners[:, (corner + 2) % 3] - corners[:, corner]
-        lengths = np.linalg.norm(after, axis=1) * np.linalg.norm(before, axis=1)
-        cosines = np.divide((after * before).sum(axis=1), lengths, out=np.ones(len(faces)), where=lengths > 0)
-        np.add.at(at_vertices, faces[:, corner], np.arccos(np.clip(cosines, -1, 1))[:, None] * units)
-    edges = np.sort(np.stack([np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)], axis=2), axis=2)
-    _, edge_ids = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
-    sums = np.zeros((edge_ids.max() + 1, 3))
-    np.add.at(sums, edge_ids.ravel(), np.repeat(units, 3, axis=0))
-    at_edges = sums[edge_ids].reshape(-1, 3, 3)  # at_edges[f, i] is the edge opposite corner i
-    on = weights > 0
-    normals = units[face_ids]
-    edge = on.sum(axis=1) == 2
-    normals[edge] = at_edges[face_ids[edge], np.argmin(weights[edge], axis=1)]
-    corner = on.sum(axis=1) == 1
-    normals[corner] = at_vertices[faces[face_ids[corner], np.argmax(weights[corner], axis=1)]]
+def _pseudo_normals(mesh: trimesh.Trimesh, face_ids: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Pseudo-normals where closest points lie: of the face, of the edge or, weighted by angles, of the corner."""
+    normals, on = mesh.face_normals[face_ids], weights > 0
+    edge, corner = on.sum(axis=1) == 2, on.sum(axis=1) == 1
+    sums = np.zeros((len(mesh.edges_unique), 3))
+    np.add.at(sums, mesh.faces_unique_edges.ravel(), np.repeat(mesh.face_normals, 3, axis=0))
+    across = (weights[edge].argmin(axis=1) + 1) % 3  # a face's edge i runs from its corner i to the next
+    normals[edge] = sums[mesh.faces_unique_edges[face_ids[edge], across]]
+    normals[corner] = mesh.vertex_normals[mesh.faces[face_ids[corner], weights[corner].argmax(axis=1)]]
     return normals

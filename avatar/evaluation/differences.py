@@ -1,19 +1,26 @@
-"""How much better or worse methods are than a baseline, and how sure that is; and what their training cost."""
+"""Differences of methods to a baseline with their intervals, and what training cost."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
 from avatar.checks import unknown_name
-from avatar.evaluation.aggregate import Interval, base_method, bootstrap_difference, method_key, order_methods
+from avatar.evaluation.aggregate import (
+    Interval,
+    base_method,
+    bootstrap_mean,
+    find_counterpart,
+    grouped,
+    method_key,
+    order_methods,
+    paired_differences,
+)
 from avatar.evaluation.metrics import METRICS
-from avatar.evaluation.scores import Score, Scores
-from avatar.evaluation.tables import Table, TableRow
+from avatar.evaluation.scores import Score, Scores, csv_text
+from avatar.evaluation.tables import Table, TableRow, interval_row
 
 ALL = "all outfits"
 COLUMNS = ("metric", "outfit", "method", "baseline", "difference", "low", "high", "confidence", "frames", "unit")
@@ -35,7 +42,7 @@ def compare_methods(
 ) -> list[Difference]:
     """Differences of every method to the baseline, paired by frame: for each outfit, then for all together.
 
-    A method's baseline is that of its own variant where there is one.
+    A method's baseline is that of its own variant where there is one, else the plain or the only one.
 
     Raises:
         AvatarError: when the baseline was not scored.
@@ -46,34 +53,17 @@ def compare_methods(
         raise unknown_name("baseline", baseline, methods)
     found = []
     for method in methods:
-        other = find_baseline(method, methods, baseline)
+        other = find_counterpart(method, methods, baseline) or (baseline if baseline in methods else None)
         if other in (None, method) or base_method(method) == "sampling":
             continue
-        pair = [row for row in frames if method_key(row) in (method, other)]
-        shared = _shared_outfits(pair, method, other)
-        groups = [(outfit, [row for row in pair if row.outfit == outfit]) for outfit in shared]
-        groups += [(ALL, pair)] if len(shared) > 1 else []
-        for outfit, mine in groups:
-            interval = bootstrap_difference(mine, metric, method, other, resamples, confidence)
+        pairs = paired_differences(frames, metric, method, other)
+        groups = {outfit: [pairs[outfit]] for outfit in sorted(pairs)}
+        if len(pairs) > 1:
+            groups[ALL] = list(pairs.values())
+        for outfit, values in groups.items():
+            interval = bootstrap_mean(values, resamples, confidence)
             found.append(Difference(metric, outfit, method, other, interval))
     return found
-
-
-def find_baseline(method: str, methods: Sequence[str], baseline: str) -> str | None:
-    """What a method is set against: the baseline of its own variant, else the plain or the only one, else nothing."""
-    candidates = [other for other in methods if base_method(other) == baseline]
-    own = baseline + method.removeprefix(base_method(method))
-    if own in candidates:
-        return own
-    if baseline in methods:
-        return baseline
-    return candidates[0] if len(candidates) == 1 else None
-
-
-def _shared_outfits(frames: Sequence, first: str, second: str) -> list[str]:
-    """Outfits of which both methods were scored on a frame; another split's frames are none of test's."""
-    seen = {key: {(row.outfit, row.frame) for row in frames if method_key(row) == key} for key in (first, second)}
-    return sorted({outfit for outfit, _ in seen[first] & seen[second]})
 
 
 def difference_table(found: Sequence[Difference], metric: str) -> Table:
@@ -81,15 +71,12 @@ def difference_table(found: Sequence[Difference], metric: str) -> Table:
     known = METRICS[metric]
     mine = [difference for difference in found if difference.metric == metric]
     methods = tuple(dict.fromkeys(difference.method for difference in mine))
-    outfits = dict.fromkeys(d.outfit for d in mine if d.outfit != ALL)
-    outfits |= dict.fromkeys(d.outfit for d in mine if d.outfit == ALL)
     cells = {(d.outfit, d.method): d.interval for d in mine}
-    rows = []
-    for outfit in outfits:
-        intervals = [cells.get((outfit, method)) for method in methods]
-        values = tuple(None if i is None else i.difference * known.scale for i in intervals)
-        texts = tuple("–" if i is None else i.written(known.scale) for i in intervals)
-        rows.append(TableRow(outfit, values, summary=outfit == ALL, texts=texts))
+    outfits = sorted(dict.fromkeys(d.outfit for d in mine), key=lambda outfit: outfit == ALL)
+    rows = [
+        interval_row(outfit, [cells.get((outfit, method)) for method in methods], known.scale, outfit == ALL)
+        for outfit in outfits
+    ]
     confidence = 100 * mine[0].interval.confidence if mine else 95
     notes = (
         f"Difference to the baseline ({', '.join(dict.fromkeys(d.baseline for d in mine))}) with its {confidence:g}% "
@@ -101,28 +88,20 @@ def difference_table(found: Sequence[Difference], metric: str) -> Table:
 
 def differences_csv(found: Sequence[Difference]) -> str:
     """All differences as tidy CSV, in the metrics' own units."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for d in found:
-        i = d.interval
-        row = (d.metric, d.outfit, d.method, d.baseline, i.difference, i.low, i.high, i.confidence, i.frames)
-        writer.writerow((*row, METRICS[d.metric].unit))
-    return text.getvalue()
+    rows = ((d.metric, d.outfit, d.method, d.baseline, *astuple(d.interval), METRICS[d.metric].unit) for d in found)
+    return csv_text(COLUMNS, rows)
 
 
 def budget_table(rows: Sequence[Score]) -> Table:
     """What each method's training took: steps and minutes a run, and whether the methods had the same."""
-    spent: dict[str, dict[tuple[str, int], tuple[int, float]]] = {}
-    for row in rows:
-        if row.steps:
-            spent.setdefault(method_key(row), {})[row.outfit, row.seed] = (row.steps, row.seconds)
+    trained = grouped((row for row in rows if row.steps), method_key)
     body, steps, minutes = [], set(), []
-    for method in order_methods(spent):
-        runs = list(spent[method].values())
-        steps |= {count for count, _ in runs}
-        minutes += [seconds / 60 for _, seconds in runs]
-        mean = (float(np.mean([count for count, _ in runs])), float(np.mean([seconds for _, seconds in runs])) / 60)
+    for method in order_methods(trained):
+        spent = {(row.outfit, row.seed): (row.steps, row.seconds / 60) for row in trained[method]}
+        counts, times = zip(*spent.values())
+        steps.update(counts)
+        minutes += times
+        mean = float(np.mean(counts)), float(np.mean(times))
         body.append(TableRow(method, mean, texts=(f"{mean[0]:,.0f}", f"{mean[1]:.1f}")))
     if not body:
         note = "Nothing here was trained."
@@ -132,7 +111,5 @@ def budget_table(rows: Sequence[Score]) -> Table:
         note = f"Equal time: {np.mean(minutes):.1f} minutes each."
     else:
         note = "Neither steps nor time were equal."
-    return Table("training of one run", "method", ("steps", "minutes"), tuple(body), (note, SHARED_NOTE))
-
-
-SHARED_NOTE = "Minutes are by the clock; jobs that share a machine slow each other down."
+    shared = "Minutes are by the clock; jobs that share a machine slow each other down."
+    return Table("training of one run", "method", ("steps", "minutes"), tuple(body), (note, shared))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
 from avatar.checks import AvatarError
-from avatar.evaluation.comparison import Comparison
+from avatar.data.outfits import Outfit
+from avatar.evaluation.metrics import Comparison
 from avatar.evaluation.scores import Scores
 from avatar.evaluation.scoring import (
     Label,
-    Outfit,
     ScoreConfig,
     draw_scan,
     frame_generator,
@@ -31,13 +32,7 @@ log = logging.getLogger(__name__)
 
 
 def score_sampling_floor(
-    outfit: Outfit,
-    split: str,
-    config: ScoreConfig,
-    points: int,
-    table: str = "",
-    commit: str = "",
-    ledger: Ledger | None = None,
+    outfit: Outfit, split: str, config: ScoreConfig, points: int, commit: str = "", ledger: Ledger | None = None
 ) -> Scores:
     """Scores a second sampling of the true surface as if it were a prediction: what a perfect surface scores.
 
@@ -48,7 +43,6 @@ def score_sampling_floor(
         points: points of the second sampling; take as many as the methods predict.
         ledger: where values are kept, as for predictions.
     """
-    names = frame_names(outfit, split)
     resample = getattr(outfit, "resample", None)
 
     def compare(frame: Frame) -> Comparison:
@@ -64,23 +58,14 @@ def score_sampling_floor(
 
     if resample is None:
         log.warning("%s: no true surface to sample again, so the sampling floor compares scan halves.", outfit.name)
-    label = Label("sampling", table=table, variant="halves" if resample is None else "", commit=commit)
-    config = replace(config, motion=False)
-    memory = remember_scores(ledger, "sampling", outfit, split, config, points=points)
-    return score_frames(outfit, split, names, config, label, compare, memory)
+    label = Label("sampling", variant="halves" if resample is None else "", commit=commit)
+    return _score_floor(outfit, split, config, points, label, compare, ledger)
 
 
 def score_body_floor(
-    outfit: Outfit,
-    split: str,
-    config: ScoreConfig,
-    points: int,
-    table: str = "",
-    commit: str = "",
-    ledger: Ledger | None = None,
+    outfit: Outfit, split: str, config: ScoreConfig, points: int, commit: str = "", ledger: Ledger | None = None
 ) -> Scores:
     """Scores points spread area-uniformly over the posed bare body as if they were a prediction: no clothes at all."""
-    names = frame_names(outfit, split)
 
     def compare(frame: Frame) -> Comparison:
         body = posed_body(outfit, frame)
@@ -88,9 +73,21 @@ def score_body_floor(
             raise AvatarError("template: the body floor needs the body's faces, and this outfit has no template.")
         return Comparison(sample_body(body, points, config.seed), draw_scan(frame, config), body)
 
-    label = Label("body", table=table, commit=commit)
-    config = replace(config, motion=False)
-    memory = remember_scores(ledger, "body", outfit, split, config, points=points)
+    return _score_floor(outfit, split, config, points, Label("body", commit=commit), compare, ledger)
+
+
+def _score_floor(
+    outfit: Outfit,
+    split: str,
+    config: ScoreConfig,
+    points: int,
+    label: Label,
+    compare: Callable[[Frame], Comparison],
+    ledger: Ledger | None,
+) -> Scores:
+    """Scores a floor's frames, each for itself: its points do not follow each other."""
+    names, config = frame_names(outfit, split), replace(config, motion=False)
+    memory = remember_scores(ledger, label.method, outfit, split, config, points=points)
     return score_frames(outfit, split, names, config, label, compare, memory)
 
 

@@ -1,111 +1,111 @@
-"""Metrics of predicted against scanned surfaces, each with its unit and printed definition (design.md 7).
-
-Pure functions take float tensors of one frame, points ``(N, 3)`` in metres and unit normals ``(N, 3)``, and return
-a 0-d tensor. `METRICS` names them for tables; a table metric takes a `Comparison`, which searches neighbours once.
-"""
+"""Metrics of predicted against scanned surfaces, each with its unit and printed definition (design.md 7)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.evaluation.closest import closest_on_mesh
-from avatar.evaluation.comparison import PENETRATION_POINTS, Comparison
 from avatar.geometry.distances import normal_difference, point_to_plane, point_to_point
-from avatar.geometry.neighbours import k_nearest
+from avatar.geometry.neighbours import k_nearest, nearest
+from avatar.geometry.surface import vertex_normals
+from avatar.records import Mesh, PointCloud, Scan
 
+PENETRATION_POINTS = 5_000  # predicted points tested a frame: a share needs no more
+EXACT_WITHIN = 0.01  # metres; beyond, depths on a body may be off by a millimetre, and come ten times cheaper
 SKIN_TOLERANCE = 1e-3  # metres a point may lie under the bare body: uncovered skin is the body itself
 SPREAD_NEIGHBOURS = 5
 DISC_NEIGHBOURS = 8
 
 
-def chamfer(points: Tensor, scan: Tensor, scan_of_point: Tensor, point_of_scan: Tensor) -> Tensor:
-    """Mean squared distance to the nearest point, both ways, added (CloSET eq. 4). Square metres."""
-    forth = point_to_point(points[None], scan[None, scan_of_point]).mean()
-    return forth + point_to_point(scan[None], points[None, point_of_scan]).mean()
+class Comparison:
+    """What a metric sees of one frame: checked, in float64, neighbours searched once for all metrics.
 
-
-def chamfer_to_plane(
-    points: Tensor, scan: Tensor, scan_normals: Tensor, scan_of_point: Tensor, point_of_scan: Tensor
-) -> Tensor:
-    """POP's Chamfer distance: scan to nearest point, squared; point to nearest scan point's plane. Square metres."""
-    forth = point_to_plane(points[None], scan[None, scan_of_point], scan_normals[None, scan_of_point]).mean()
-    return forth + point_to_point(scan[None], points[None, point_of_scan]).mean()
-
-
-def normal_l1(normals: Tensor, scan_normals: Tensor, scan_of_point: Tensor) -> Tensor:
-    """Mean L1 norm of the normals' difference, prediction to nearest scan point (CloSET eq. 5)."""
-    return normal_difference(normals[None], scan_normals[None, scan_of_point]).mean()
-
-
-def scan_to_discs(scan: Tensor, points: Tensor, normals: Tensor, point_of_scan: Tensor, radius: float) -> Tensor:
-    """Mean distance from scan points to the disc at their nearest predicted point. Metres.
-
-    A point cloud's surface for D_s2m: exact planes would hide holes (a plane runs on over them), bare points would
-    count their own spacing as error.
+    ``points (N, 3)`` and ``normals (N, 3)`` of the prediction, ``scan (M, 3)`` and ``scan_normals (M, 3)``, float64
+    on the CPU, normals scaled to length one. ``mesh`` is the predicted mesh where there is one, ``body`` the posed
+    bare body.
     """
-    away = scan - points[point_of_scan]
-    height = (away * normals[point_of_scan]).sum(dim=-1)
-    aside = (away.square().sum(dim=-1) - height.square()).clamp(min=0).sqrt()
-    return torch.hypot(height, (aside - radius).clamp(min=0)).mean()
+
+    def __init__(self, prediction: PointCloud, scan: Scan, body: Mesh | None = None, mesh: Mesh | None = None):
+        """Checks and converts one frame.
+
+        Raises:
+            AvatarError: on an empty cloud, wrong shapes, non-finite numbers or normals without direction.
+        """
+        self.points, self.normals = _oriented("prediction", prediction.points, prediction.normals)
+        self.scan, self.scan_normals = _oriented("scan", scan.points, scan.normals)
+        self.body, self.mesh = body, mesh
+
+    @cached_property
+    def scan_of_point(self) -> Tensor:
+        """Index of the nearest scan point to each predicted point, ``(N,)``."""
+        return nearest(self.points[None], self.scan[None])[0]
+
+    @cached_property
+    def point_of_scan(self) -> Tensor:
+        """Index of the nearest predicted point to each scan point, ``(M,)``."""
+        return nearest(self.scan[None], self.points[None])[0]
+
+    @cached_property
+    def depths(self) -> Tensor:
+        """How deep predicted points lie under the bare body, positive inside; at most `PENETRATION_POINTS` of them.
+
+        The points are an even stride through the prediction.
+
+        Raises:
+            AvatarError: without a body.
+        """
+        if self.body is None:
+            raise AvatarError(
+                "body: penetration needs the posed bare body and its faces, and none was given; load frames from a "
+                "dataset with a template, or leave the penetration metrics out."
+            )
+        chosen = self.points[:: -(-len(self.points) // PENETRATION_POINTS)].numpy()
+        hits = closest_on_mesh(chosen, self.body.vertices, self.body.faces, EXACT_WITHIN)
+        return torch.from_numpy(-hits.signed_distances)
 
 
-def scan_to_mesh(scan: Tensor, vertices: np.ndarray, faces: np.ndarray) -> Tensor:
-    """Mean exact distance from scan points to a mesh (SCANimate's D_s2m). Metres."""
-    hits = closest_on_mesh(scan.numpy(), vertices, faces)
-    return torch.from_numpy(np.abs(hits.signed_distances)).mean()
+def _double(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, np.float64))
 
 
-def normal_l2(scan_normals: Tensor, normals: Tensor, point_of_scan: Tensor) -> Tensor:
-    """Mean L2 norm of the normals' difference, scan to nearest predicted point or vertex (SCANimate's D_n)."""
-    return (scan_normals - normals[point_of_scan]).norm(dim=-1).mean()
+def _oriented(name: str, points: np.ndarray, normals: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Points and unit normals as float64 tensors."""
+    dims = check_shape(f"{name} points", points, "N 3")
+    check_shape(f"{name} normals", normals, "N 3", **dims)
+    if dims["N"] == 0:
+        raise AvatarError(f"{name}: expected points, got an empty cloud.")
+    check_finite(f"{name} points", points)
+    check_finite(f"{name} normals", normals)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    if lengths.min() < 1e-6:
+        bad = int((lengths < 1e-6).sum())
+        raise AvatarError(f"{name} normals: expected unit vectors, got {bad} of {len(normals)} without length.")
+    return _double(points), _double(normals / lengths)
 
 
-def f_score(to_scan: Tensor, to_points: Tensor, threshold: float) -> Tensor:
-    """Harmonic mean of the shares of predicted and of scan points that have the other within a threshold.
+class Unit(NamedTuple):
+    """A unit that values are kept in, and how they are shown: ``value * scale`` in ``shown_in``."""
 
-    ``to_scan (N,)`` and ``to_points (M,)`` are distances to the nearest point of the other cloud, metres.
-    """
-    precision = (to_scan <= threshold).double().mean()
-    recall = (to_points <= threshold).double().mean()
-    return 2 * precision * recall / (precision + recall).clamp(min=1e-12)
+    unit: str
+    scale: float
+    shown_in: str
 
 
-def penetration_share(depths: Tensor, tolerance: float = SKIN_TOLERANCE) -> Tensor:
-    """Share of points deeper under the body's surface than the tolerance. ``(N,)`` depths, positive inside."""
-    return (depths > tolerance).double().mean()
-
-
-def penetration_depth(depths: Tensor, tolerance: float = SKIN_TOLERANCE) -> Tensor:
-    """Mean depth of the points deeper than the tolerance, zero if there are none. Metres."""
-    inside = depths[depths > tolerance]
-    return inside.mean() if len(inside) else depths.new_zeros(())
-
-
-def neighbour_spread(points: Tensor, k: int = SPREAD_NEIGHBOURS) -> Tensor:
-    """Unevenness of a cloud: standard deviation over mean of the points' mean distance to k neighbours."""
-    distances = neighbour_distances(points, k).mean(dim=-1)
-    return distances.std(correction=0) / distances.mean().clamp(min=1e-30)
-
-
-def neighbour_distances(points: Tensor, k: int) -> Tensor:
-    """Distances to the k nearest other points, ``(N, 3)`` to ``(N, k)``."""
-    if len(points) <= k:
-        raise AvatarError(f"points: expected more than {k} points to measure their spread, got {len(points)}.")
-    ids = k_nearest(points[None], points[None], k + 1)[0]
-    return (points[ids] - points[:, None]).norm(dim=-1).sort(dim=-1).values[:, 1:]
-
-
-def mean_acceleration(sequence: Tensor) -> Tensor:
-    """Mean length of second differences of corresponding points, ``(T, N, 3)`` with T >= 3. Metres a frame^2."""
-    if sequence.ndim != 3 or len(sequence) < 3:
-        raise AvatarError(f"sequence: expected at least 3 frames (T, N, 3), got {tuple(sequence.shape)}.")
-    return (sequence[2:] - 2 * sequence[1:-1] + sequence[:-2]).norm(dim=-1).mean()
+AREA = Unit("m^2", 1e4, "1e-4 m²")
+TENTHS = Unit("1", 10, "1e-1")
+CENTIMETRES = Unit("cm", 1, "cm")
+MILLIMETRES = Unit("m", 1e3, "mm")
+PERCENT = Unit("1", 100, "%")
+RATIO = Unit("1", 1, "1")
+ACCELERATION = Unit("m/frame^2", 1e3, "mm/frame²")
 
 
 @dataclass(frozen=True)
@@ -125,146 +125,187 @@ class Metric:
     sequential: bool = False
     needs_body: bool = False
 
-
-def _surface_distance(c: Comparison) -> Tensor:
-    if c.mesh is not None:
-        return 100 * scan_to_mesh(c.scan, c.mesh.vertices, c.mesh.faces)
-    radius = float(neighbour_distances(c.points, DISC_NEIGHBOURS).mean(dim=-1).quantile(0.5))
-    return 100 * scan_to_discs(c.scan, c.points, c.normals, c.point_of_scan, radius)
+    @property
+    def heading(self) -> str:
+        """The name and the unit that it is shown in, where it has one."""
+        return self.name if self.shown_in == "1" else f"{self.name} ({self.shown_in})"
 
 
-def _normal_consistency(c: Comparison) -> Tensor:
-    if c.mesh is not None:
-        return normal_l2(c.scan_normals, c.mesh_normals, c.mesh_vertex_of_scan)
-    return normal_l2(c.scan_normals, c.normals, c.point_of_scan)
+METRIC_NAMES = (  # one literal, for settings are read without running the functions below (`avatar.declared`)
+    *("cd_point", "cd_pop", "normal_l1", "normal_l1_mean", "s2m_cm", "normal_consistency", "f_score_5mm"),
+    *("f_score_1cm", "penetration_share", "penetration_depth", "uniformity", "jitter"),
+)
+METRICS: dict[str, Metric] = {}
 
 
-METRICS: dict[str, Metric] = {
-    metric.name: metric
-    for metric in (
-        Metric(
-            "cd_point",
-            "m^2",
-            1e4,
-            "1e-4 m²",
-            "Chamfer distance, CloSET eq. 4: mean over predicted points of the squared distance to the nearest scan "
-            "point, plus mean over scan points of the squared distance to the nearest predicted point.",
-            lambda c: chamfer(c.points, c.scan, c.scan_of_point, c.point_of_scan),
-        ),
-        Metric(
-            "cd_pop",
-            "m^2",
-            1e4,
-            "1e-4 m²",
-            "Chamfer distance as POP computes it: mean over scan points of the squared distance to the nearest "
-            "predicted point, plus mean over predicted points of the squared distance to the tangent plane at the "
-            "nearest scan point.",
-            lambda c: chamfer_to_plane(c.points, c.scan, c.scan_normals, c.scan_of_point, c.point_of_scan),
-        ),
-        Metric(
-            "normal_l1",
-            "1",
-            10,
-            "1e-1",
-            "Normal discrepancy, CloSET eq. 5: mean over predicted points of the L1 norm of the difference to the "
-            "normal of the nearest scan point.",
-            lambda c: normal_l1(c.normals, c.scan_normals, c.scan_of_point),
-        ),
-        Metric(
-            "normal_l1_mean",
-            "1",
-            10,
-            "1e-1",
-            "A third of normal_l1: the mean over the three components, which POP's tables print.",
-            lambda c: normal_l1(c.normals, c.scan_normals, c.scan_of_point) / 3,
-        ),
-        Metric(
-            "s2m_cm",
-            "cm",
-            1,
-            "cm",
-            "Scan-to-surface distance, SCANimate D_s2m: mean over scan points of the distance to the predicted mesh; "
-            "for a point cloud to the disc at the nearest predicted point, its radius the cloud's median distance to "
-            f"{DISC_NEIGHBOURS} neighbours.",
-            _surface_distance,
-        ),
-        Metric(
-            "normal_consistency",
-            "1",
-            10,
-            "1e-1",
-            "SCANimate D_n: mean over scan points of the L2 norm of the difference to the normal of the nearest "
-            "predicted point (of the nearest vertex, for a mesh).",
-            _normal_consistency,
-        ),
-        Metric(
-            "f_score_5mm",
-            "1",
-            100,
-            "%",
-            "F-score at 5 mm: harmonic mean of the share of predicted points within 5 mm of a scan point and the "
-            "share of scan points within 5 mm of a predicted point. Higher is better.",
-            lambda c: f_score(c.to_scan, c.to_points, 5e-3),
-            higher_is_better=True,
-        ),
-        Metric(
-            "f_score_1cm",
-            "1",
-            100,
-            "%",
-            "F-score at 1 cm: as f_score_5mm, within 1 cm. Higher is better.",
-            lambda c: f_score(c.to_scan, c.to_points, 1e-2),
-            higher_is_better=True,
-        ),
-        Metric(
-            "penetration_share",
-            "1",
-            100,
-            "%",
-            f"Share of predicted points more than {1e3 * SKIN_TOLERANCE:g} mm under the posed bare body's surface "
-            f"(at most {PENETRATION_POINTS:,} points a frame are tested).",
-            lambda c: penetration_share(c.depths),
-            needs_body=True,
-        ),
-        Metric(
-            "penetration_depth",
-            "m",
-            1e3,
-            "mm",
-            "Mean depth under the bare body's surface of the points that penetration_share counts, 0 if none.",
-            lambda c: penetration_depth(c.depths),
-            needs_body=True,
-        ),
-        Metric(
-            "uniformity",
-            "1",
-            1,
-            "1",
-            "Spread of the predicted points: standard deviation over mean of their mean distance to "
-            f"{SPREAD_NEIGHBOURS} nearest neighbours. 0 is a regular grid; gaps and clumps raise it.",
-            lambda c: neighbour_spread(c.points),
-        ),
-        Metric(
-            "jitter",
-            "m/frame^2",
-            1e3,
-            "mm/frame²",
-            "Mean acceleration of corresponding predicted points over consecutive frames of a sequence (second "
-            "difference of position). Only for predictions whose points keep their order.",
-            mean_acceleration,
-            sequential=True,
-        ),
-    )
-}
+def metric(name: str, unit: Unit, **properties: bool) -> Callable[[Callable], Callable]:
+    """A decorator that adds a function to `METRICS`; its docstring is the definition that tables print."""
+
+    def add(measure: Callable) -> Callable:
+        definition = " ".join((measure.__doc__ or "").split())
+        METRICS[name] = Metric(name, *unit, definition, measure, **properties)
+        return measure
+
+    return add
 
 
-def find_metrics(names: tuple[str, ...]) -> list[Metric]:
+def find_metrics(names: Iterable[str]) -> list[Metric]:
     """The metrics of these names, in their order.
 
     Raises:
         AvatarError: naming the unknown ones and all that there are.
     """
+    names = list(names)
     unknown = [name for name in names if name not in METRICS]
     if unknown:
         raise AvatarError(f"metrics: unknown {', '.join(unknown)}; expected any of {', '.join(METRICS)}.")
     return [METRICS[name] for name in names]
+
+
+@metric("cd_point", AREA)
+def chamfer(c: Comparison) -> Tensor:
+    """Chamfer distance, CloSET eq. 4: mean over predicted points of the squared distance to the nearest scan point,
+    plus mean over scan points of the squared distance to the nearest predicted point.
+    """
+    return point_to_point(c.points[None], c.scan[None, c.scan_of_point]).mean() + _scan_to_points(c)
+
+
+@metric("cd_pop", AREA)
+def chamfer_to_plane(c: Comparison) -> Tensor:
+    """Chamfer distance as POP computes it: mean over scan points of the squared distance to the nearest predicted
+    point, plus mean over predicted points of the squared distance to the tangent plane at the nearest scan point.
+    """
+    ids = c.scan_of_point
+    return point_to_plane(c.points[None], c.scan[None, ids], c.scan_normals[None, ids]).mean() + _scan_to_points(c)
+
+
+def _scan_to_points(c: Comparison) -> Tensor:
+    return point_to_point(c.scan[None], c.points[None, c.point_of_scan]).mean()
+
+
+@metric("normal_l1", TENTHS)
+def normal_l1(c: Comparison) -> Tensor:
+    """Normal discrepancy, CloSET eq. 5: mean over predicted points of the L1 norm of the difference to the normal of
+    the nearest scan point.
+    """
+    return normal_difference(c.normals[None], c.scan_normals[None, c.scan_of_point]).mean()
+
+
+@metric("normal_l1_mean", TENTHS)
+def normal_l1_mean(c: Comparison) -> Tensor:
+    """A third of normal_l1: the mean over the three components, which POP's tables print."""
+    return normal_l1(c) / 3
+
+
+@metric("s2m_cm", CENTIMETRES)
+def scan_to_surface(c: Comparison) -> Tensor:
+    """Scan-to-surface distance, SCANimate D_s2m: mean over scan points of the distance to the predicted mesh; for a
+    point cloud to the disc at the nearest predicted point, its radius the cloud's median distance to 8 neighbours.
+    """
+    if c.mesh is not None:
+        hits = closest_on_mesh(c.scan.numpy(), c.mesh.vertices, c.mesh.faces)
+        return 100 * torch.from_numpy(np.abs(hits.signed_distances)).mean()
+    radius = float(neighbour_distances(c.points, DISC_NEIGHBOURS).mean(dim=-1).quantile(0.5))
+    return 100 * scan_to_discs(c.scan, c.points, c.normals, c.point_of_scan, radius)
+
+
+def scan_to_discs(scan: Tensor, points: Tensor, normals: Tensor, point_of_scan: Tensor, radius: float) -> Tensor:
+    """Mean distance from scan points to the disc at their nearest predicted point. Metres.
+
+    A point cloud's surface for D_s2m: exact planes would hide holes (a plane runs on over them), bare points would
+    count their own spacing as error.
+    """
+    away = scan - points[point_of_scan]
+    height = (away * normals[point_of_scan]).sum(dim=-1)
+    aside = (away.square().sum(dim=-1) - height.square()).clamp(min=0).sqrt()
+    return torch.hypot(height, (aside - radius).clamp(min=0)).mean()
+
+
+@metric("normal_consistency", TENTHS)
+def normal_consistency(c: Comparison) -> Tensor:
+    """SCANimate D_n: mean over scan points of the L2 norm of the difference to the normal of the nearest predicted
+    point (of the nearest vertex, for a mesh).
+    """
+    normals, ids = c.normals, c.point_of_scan
+    if c.mesh is not None:
+        vertices = _double(c.mesh.vertices)
+        normals = vertex_normals(vertices, torch.from_numpy(np.asarray(c.mesh.faces, np.int64)))
+        ids = nearest(c.scan[None], vertices[None])[0]
+    return (c.scan_normals - normals[ids]).norm(dim=-1).mean()
+
+
+@metric("f_score_5mm", PERCENT, higher_is_better=True)
+def f_score_5mm(c: Comparison) -> Tensor:
+    """F-score at 5 mm: harmonic mean of the share of predicted points within 5 mm of a scan point and the share of
+    scan points within 5 mm of a predicted point. Higher is better.
+    """
+    return _f_score(c, 5e-3)
+
+
+@metric("f_score_1cm", PERCENT, higher_is_better=True)
+def f_score_1cm(c: Comparison) -> Tensor:
+    """F-score at 1 cm: as f_score_5mm, within 1 cm. Higher is better."""
+    return _f_score(c, 1e-2)
+
+
+def _f_score(c: Comparison, threshold: float) -> Tensor:
+    to_scan = (c.points - c.scan[c.scan_of_point]).norm(dim=-1)
+    to_points = (c.scan - c.points[c.point_of_scan]).norm(dim=-1)
+    return f_score(to_scan, to_points, threshold)
+
+
+def f_score(to_scan: Tensor, to_points: Tensor, threshold: float) -> Tensor:
+    """Harmonic mean of the shares of predicted and of scan points that have the other within a threshold.
+
+    ``to_scan (N,)`` and ``to_points (M,)`` are distances to the nearest point of the other cloud, metres.
+    """
+    precision = (to_scan <= threshold).double().mean()
+    recall = (to_points <= threshold).double().mean()
+    return 2 * precision * recall / (precision + recall).clamp(min=1e-12)
+
+
+@metric("penetration_share", PERCENT, needs_body=True)
+def penetration_share(c: Comparison) -> Tensor:
+    """Share of predicted points more than 1 mm under the posed bare body's surface (at most 5,000 points a frame are
+    tested).
+    """
+    return (c.depths > SKIN_TOLERANCE).double().mean()
+
+
+@metric("penetration_depth", MILLIMETRES, needs_body=True)
+def penetration_depth(c: Comparison) -> Tensor:
+    """Mean depth under the bare body's surface of the points that penetration_share counts, 0 if none."""
+    inside = c.depths[c.depths > SKIN_TOLERANCE]
+    return inside.mean() if len(inside) else c.depths.new_zeros(())
+
+
+@metric("uniformity", RATIO)
+def uniformity(c: Comparison) -> Tensor:
+    """Spread of the predicted points: standard deviation over mean of their mean distance to 5 nearest neighbours. 0
+    is a regular grid; gaps and clumps raise it.
+    """
+    return neighbour_spread(c.points)
+
+
+def neighbour_spread(points: Tensor, k: int = SPREAD_NEIGHBOURS) -> Tensor:
+    """Unevenness of a cloud: standard deviation over mean of the points' mean distance to k neighbours."""
+    distances = neighbour_distances(points, k).mean(dim=-1)
+    return distances.std(correction=0) / distances.mean().clamp(min=1e-30)
+
+
+def neighbour_distances(points: Tensor, k: int) -> Tensor:
+    """Distances to the k nearest other points, ``(N, 3)`` to ``(N, k)``."""
+    if len(points) <= k:
+        raise AvatarError(f"points: expected more than {k} points to measure their spread, got {len(points)}.")
+    ids = k_nearest(points[None], points[None], k + 1)[0]
+    return (points[ids] - points[:, None]).norm(dim=-1).sort(dim=-1).values[:, 1:]
+
+
+@metric("jitter", ACCELERATION, sequential=True)
+def mean_acceleration(sequence: Tensor) -> Tensor:
+    """Mean acceleration of corresponding predicted points over consecutive frames of a sequence (second difference of
+    position). Only for predictions whose points keep their order.
+    """
+    if sequence.ndim != 3 or len(sequence) < 3:
+        raise AvatarError(f"sequence: expected at least 3 frames (T, N, 3), got {tuple(sequence.shape)}.")
+    return (sequence[2:] - 2 * sequence[1:-1] + sequence[:-2]).norm(dim=-1).mean()

@@ -6,16 +6,24 @@ import csv
 import html
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from avatar.checks import AvatarError, DataError, require
-from avatar.evaluation.aggregate import method_key, order_methods, tabulate
-from avatar.evaluation.metrics import find_metrics
-from avatar.evaluation.scores import FrameScore, Score
+from avatar.evaluation.aggregate import (
+    FLOORS,
+    base_method,
+    frame_weighted_mean,
+    grouped,
+    method_key,
+    order_methods,
+    tabulate,
+)
+from avatar.evaluation.metrics import Metric, find_metrics
+from avatar.evaluation.scores import Score
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,32 +68,96 @@ def plot_outfits(rows: Sequence[Score], metric: str) -> Figure:
         bars = [(x, cells[method]) for x, cells in enumerate(grid.values()) if method in cells]
         left = [x - 0.4 + width * (place + 0.5) for x, _ in bars]
         heights = [cell.value * known.scale for _, cell in bars]
-        panel.bar(left, heights, 0.92 * width, color=COLOURS[place % len(COLOURS)], label=method)
+        panel.bar(left, heights, 0.92 * width, color=colour_of(place), label=method)
     panel.set_xticks(range(len(grid)), list(grid), fontsize=8)
-    panel.set_ylabel(f"{known.name} ({known.shown_in})", fontsize=8, color=INK)
-    add_legend(figure, panel)
-    return figure
+    return _finish(figure, panel, known)
 
 
-def plot_frames(frames: Sequence[FrameScore], metric: str, outfit: str) -> Figure:
-    """One metric over the frames of an outfit, a line a method."""
+def plot_fractions(rows: Sequence[Score], metric: str) -> Figure:
+    """The mean over frames of one metric against the share of the training frames, a line a method.
+
+    Floors that were not trained are level lines.
+
+    Raises:
+        AvatarError: for a metric that nobody scored.
+    """
     (known,) = find_metrics([metric])
-    lines: dict[str, dict[str, float]] = {}
-    for row in frames:
-        if row.metric == metric and row.outfit == outfit:
-            lines.setdefault(method_key(row), {})[row.frame] = row.value * known.scale
-    if not lines:
-        raise AvatarError(f"frames: no score of {metric} on {outfit}.")
-    names = sorted({name for values in lines.values() for name in values})
-    figure, (panel,) = make_panels(1, (7.2, 3.0))
-    for place, method in enumerate(order_methods(set(lines))):
-        heights = [lines[method].get(name, np.nan) for name in names]
-        panel.plot(heights, color=COLOURS[place % len(COLOURS)], linewidth=1.4, marker="o", markersize=3, label=method)
-    step = -(-len(names) // 24)
-    panel.set_xticks(range(0, len(names), step), names[::step], fontsize=6, rotation=60, ha="right")
-    panel.set_ylabel(f"{known.name} ({known.shown_in})", fontsize=8, color=INK)
+    groups = grouped(_scores_of(rows, metric).values(), lambda mine: mine[0].method)
+    shares = sorted({100 * row.fraction for row in rows if row.steps})
+    figure, (panel,) = make_panels(1, (6.0, 3.4))
+    for place, method in enumerate(order_methods(groups)):
+        points = sorted((100 * mine[0].fraction, frame_weighted_mean(mine) * known.scale) for mine in groups[method])
+        style = {"color": colour_of(place), "label": method}
+        if method in FLOORS[:2]:
+            panel.axhline(points[0][1], linewidth=1.2, linestyle=":", **style)
+        else:
+            panel.plot(*zip(*points), linewidth=1.4, marker="o", markersize=4, **style)
+    panel.set_xscale("log")
+    panel.set_xticks(shares, [f"{share:g}%" for share in shares])
+    panel.minorticks_off()
+    return _finish(figure, panel, known, "share of the training frames")
+
+
+def plot_times(rows: Sequence[Score], metric: str) -> Figure:
+    """The mean over frames of one metric against the minutes of training a run, a point a method and variant.
+
+    Raises:
+        AvatarError: for a metric that nobody scored.
+    """
+    (known,) = find_metrics([metric])
+    groups = _scores_of(rows, metric)
+    means = {method: frame_weighted_mean(mine) * known.scale for method, mine in groups.items()}
+    figure, (panel,) = make_panels(1, (6.0, 3.4))
+    for place, method in enumerate(m for m in order_methods(groups) if groups[m][0].steps):
+        minutes = sum(row.seconds for row in groups[method]) / len(groups[method]) / 60
+        panel.plot(minutes, means[method], "o", color=colour_of(place), markersize=6, label=method)
+    for method, level in means.items():
+        if base_method(method) == "sampling":
+            panel.axhline(level, color=INK, linewidth=1.0, linestyle=":", label=method)
+    panel.set_xlim(left=0)
+    return _finish(figure, panel, known, "minutes of training a run")
+
+
+def plot_progress(logs: Mapping[str, Mapping[str, Path]]) -> Figure:
+    """Chamfer distance on held-back training frames against the minutes trained: a panel an outfit, a line a method.
+
+    Args:
+        logs: training logs by outfit and method; those that never validated a Chamfer distance draw no line.
+    """
+    figure, panels = make_panels(len(logs))
+    methods = order_methods({method for mine in logs.values() for method in mine})
+    for panel, (outfit, mine) in zip(panels, logs.items()):
+        for place, method in enumerate(methods):
+            points = read_curves(mine[method], "seconds").get("chamfer", {}) if method in mine else {}
+            curve = [(seconds / 60, value * 1e4) for seconds, value in points.get("validation", [])]
+            panel.plot(*zip(*curve or [(np.nan, np.nan)]), ".-", color=colour_of(place), linewidth=1.4, label=method)
+        panel.set_title(outfit, fontsize=9, color=INK)
+        panel.set_xlabel("minutes of training", fontsize=8, color=INK)
+        panel.set_ylabel("Chamfer, held back (1e-4 m²)", fontsize=8, color=INK)
+    add_legend(figure, panels[0])
+    return figure
+
+
+def _scores_of(rows: Sequence[Score], metric: str) -> dict[str, list[Score]]:
+    """The rows of one metric by method and variant."""
+    groups = grouped((row for row in rows if row.metric == metric), method_key)
+    if not groups:
+        raise AvatarError(f"rows: no score of {metric} among them.")
+    return groups
+
+
+def _finish(figure: Figure, panel: Axes, metric: Metric, across: str = "") -> Figure:
+    """Names the axes of a plot of a metric and adds the legend."""
+    if across:
+        panel.set_xlabel(across, fontsize=8, color=INK)
+    panel.set_ylabel(f"{metric.name} ({metric.shown_in})", fontsize=8, color=INK)
     add_legend(figure, panel)
     return figure
+
+
+def colour_of(place: int) -> str:
+    """The colour of the method at a place in the legend."""
+    return COLOURS[place % len(COLOURS)]
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:

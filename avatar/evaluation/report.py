@@ -1,13 +1,13 @@
-"""The report of a run: one self-contained HTML page that opens anywhere, offline, without scripts."""
+"""The report of a run: one HTML page without scripts or outside requests, for light, dark, narrow and paper."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
+from string import Template
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
@@ -15,7 +15,6 @@ import numpy as np
 
 import avatar
 from avatar.checks import AvatarError, check_shape, require
-from avatar.evaluation.page import assemble_page
 from avatar.evaluation.plots import inline_svg, plot_losses
 from avatar.evaluation.tables import Table
 from avatar.io.npz import write_whole
@@ -25,6 +24,84 @@ if TYPE_CHECKING:
 
 COLUMNS = ("ground truth", "prediction", "template", "mesh", "error")
 WEBP = {"format": "WEBP", "quality": 90, "method": 4}
+
+
+STYLE = """
+:root { color-scheme: light dark; --page: #f6f6f3; --card: #fff; --ink: #1c2027; --soft: #646b76; --line: #e2e2dd;
+  --accent: #2f6fc9; --missing: #9a6a12; --paper: #fff; }
+@media (prefers-color-scheme: dark) { :root { --page: #13151a; --card: #1c1f26; --ink: #e7e9ed; --soft: #9aa2af;
+  --line: #2f343e; --accent: #7fb0f5; --missing: #e0b25c; --paper: #e9eaec; } }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.55 system-ui, sans-serif; }
+header, main, footer { max-width: 1120px; margin: 0 auto; padding: 0 24px; }
+header { padding-top: 40px; }
+h1 { margin: 0 0 4px; font-size: 30px; line-height: 1.2; letter-spacing: -0.02em; overflow-wrap: anywhere; }
+h2 { margin: 0 0 16px; font-size: 19px; letter-spacing: -0.01em; }
+h3 { margin: 24px 0 8px; font-size: 15px; }
+p { max-width: 75ch; }
+a { color: var(--accent); }
+nav { display: flex; flex-wrap: wrap; gap: 4px 18px; margin: 18px 0 22px; font-size: 14px; }
+nav a { text-decoration: none; }
+section { background: var(--card); border: 1px solid var(--line); border-radius: 12px; padding: 22px 24px;
+  margin-bottom: 20px; }
+.soft, footer { color: var(--soft); font-size: 13px; }
+footer { padding-bottom: 40px; }
+.missing { color: var(--missing); }
+.missing::before { content: "\\2014\\00a0"; }
+.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin: 16px 0 0; }
+.facts div { border: 1px solid var(--line); border-radius: 10px; padding: 10px 14px; }
+.facts dt { color: var(--soft); font-size: 12.5px; }
+.facts dd { margin: 0; font-size: 19px; font-weight: 600; font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; min-width: 50%; }
+th, td { padding: 6px 14px; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line); }
+th { font-weight: 600; }
+thead th { color: var(--soft); font-size: 13px; }
+tbody th, thead th:first-child { text-align: left; font-weight: 500; }
+tr.summary { background: color-mix(in srgb, var(--ink) 5%, transparent); font-weight: 600; }
+.notes { margin: 12px 0 0; padding-left: 18px; color: var(--soft); font-size: 13px; }
+.notes li { margin: 2px 0; }
+.plot svg { display: block; width: 100%; height: auto; margin: 0 auto; }
+pre { margin: 0; max-height: 480px; overflow: auto; font: 12.5px/1.5 ui-monospace, monospace; tab-size: 2; }
+.pictures { display: grid; gap: 8px; min-width: calc(var(--columns) * 130px);
+  grid-template-columns: repeat(var(--columns), minmax(0, 1fr)); }
+.pictures .head { color: var(--soft); font-size: 13px; font-weight: 600; }
+.pictures .pose { grid-column: 1 / -1; margin-top: 10px; font-size: 13.5px; font-weight: 600; overflow-wrap: anywhere; }
+figure { margin: 0; }
+figure img { display: block; width: 100%; height: auto; background: var(--paper); border-radius: 8px; }
+figcaption { color: var(--soft); font-size: 12.5px; margin-top: 4px; }
+.files { margin: 0; padding: 0; list-style: none; columns: 2 340px; font-size: 13.5px; }
+.files li { padding: 2px 0; overflow-wrap: anywhere; break-inside: avoid; }
+@media (max-width: 640px) { header, main, footer { padding-left: 14px; padding-right: 14px; }
+  section { padding: 16px; } h1 { font-size: 24px; } }
+@media print { :root { --page: #fff; --card: #fff; --ink: #000; --soft: #444; --line: #ccc; color-scheme: light; }
+  nav { display: none; } section { border: 0; padding: 8px 0; } figure, table, .plot { break-inside: avoid; }
+  pre { max-height: none; white-space: pre-wrap; } }
+"""
+
+PAGE = Template("""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<link rel="icon" href="data:,">
+<title>$title</title>
+<style>$style</style>
+</head>
+<body>
+<header>
+<h1>$title</h1>
+<div class="soft">$subtitle</div>
+<nav>$links</nav>
+</header>
+<main>
+$sections
+</main>
+<footer>$footer</footer>
+</body>
+</html>
+""")
 
 
 @dataclass(frozen=True)
@@ -68,16 +145,28 @@ def write_report(run_folder: str | Path, content: ReportContent) -> Path:
         AvatarError: when a picture is not an image, or a row has another number of pictures than columns.
         DataError: when the training log is there and cannot be read.
     """
-    folder = Path(run_folder)
+    folder, text = Path(run_folder), content.config_yaml
+    settings = f"<pre>{escape(text)}</pre>" if text.strip() else _missing("No configuration was recorded.")
+    files = "".join(_file(folder, Path(file)) for file in content.files)
     sections = {
         "Summary": _summary(content),
         "Pictures": _pictures(content),
         "Metrics": _metrics(content),
         "Training": _training(content.metrics_csv),
-        "Configuration": _configuration(content.config_yaml),
-        "Files": _files(folder, content.files),
+        "Configuration": settings,
+        "Files": f'<ul class="files">{files}</ul>' if files else _missing("This run made no files."),
     }
-    page = assemble_page(content.title, content.subtitle, sections, f"Written by avatar {avatar.__version__}.")
+    page = PAGE.substitute(
+        title=escape(content.title),
+        subtitle=escape(content.subtitle),
+        style=STYLE,
+        links=" ".join(f'<a href="#{heading.lower()}">{heading}</a>' for heading in sections),
+        sections="\n".join(
+            f'<section id="{heading.lower()}">\n<h2>{heading}</h2>\n{body}\n</section>'
+            for heading, body in sections.items()
+        ),
+        footer=f"Written by avatar {avatar.__version__}.",
+    )
     write_whole(folder / "report.html", page.encode())
     return folder / "report.html"
 
@@ -147,13 +236,11 @@ def _metrics(content: ReportContent) -> str:
 
 def _table(table: Table) -> str:
     head = "".join(f'<th scope="col">{escape(column)}</th>' for column in (table.corner, *table.heads))
-    rows = [
-        ('<tr class="summary">' if row.summary else "<tr>")
-        + f'<th scope="row">{escape(row.label)}</th>'
-        + "".join(f"<td>{escape(cell)}</td>" for cell in row.cells)
-        + "</tr>"
-        for row in table.rows
-    ]
+    rows = []
+    for row in table.rows:
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row.cells)
+        kind = ' class="summary"' if row.summary else ""
+        rows.append(f'<tr{kind}><th scope="row">{escape(row.label)}</th>{cells}</tr>')
     body = "\n".join(rows)
     return (
         f"<h3>{escape(table.title)}</h3>\n"
@@ -172,20 +259,11 @@ def _plot(figure: Figure, prefix: str, title: str) -> str:
     return f'<div class="plot">{inline_svg(figure, prefix, title)}</div>'
 
 
-def _configuration(config_yaml: str) -> str:
-    return f"<pre>{escape(config_yaml)}</pre>" if config_yaml.strip() else _missing("No configuration was recorded.")
-
-
-def _files(folder: Path, files: Sequence[Path]) -> str:
-    if not files:
-        return _missing("This run made no files.")
-    return '<ul class="files">' + "".join(_file(folder, Path(file)) for file in files) + "</ul>"
-
-
 def _file(folder: Path, file: Path) -> str:
     """A file as a link relative to the report where it lies in the run, with its size."""
-    inside = file.resolve().is_relative_to(folder.resolve())
-    shown = file.resolve().relative_to(folder.resolve()).as_posix() if inside else str(file)
+    whole, home = file.resolve(), folder.resolve()
+    inside = whole.is_relative_to(home)
+    shown = whole.relative_to(home).as_posix() if inside else str(file)
     name = f'<a href="{quote(shown)}">{escape(shown)}</a>' if inside else escape(shown)
     if file.is_dir():
         return f'<li>{name} <span class="soft">{sum(1 for _ in file.iterdir()):,} files</span></li>'

@@ -76,9 +76,9 @@ def write_scores(path: str | Path, scores: Scores) -> None:
     Numbers are written so that reading gives back the same bits.
     """
     path = Path(path)
-    write_whole(path, _to_csv(Score, scores.rows))
+    _write_rows(path, Score, scores.rows)
     if scores.frames:
-        write_whole(frames_path(path), _to_csv(FrameScore, scores.frames))
+        _write_rows(frames_path(path), FrameScore, scores.frames)
     else:
         frames_path(path).unlink(missing_ok=True)
 
@@ -101,12 +101,15 @@ def frames_path(path: Path) -> Path:
     return path.with_name(f"{path.stem}.frames.csv")
 
 
-def _to_csv(kind: type[Row], rows: Iterable[Row]) -> bytes:
+def csv_text(columns: Iterable[str], rows: Iterable[Iterable]) -> str:
+    """A CSV file's text: its header and its rows."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([f.name for f in fields(kind)])
-    writer.writerows(astuple(row) for row in rows)
-    return text.getvalue().encode()
+    csv.writer(text, lineterminator="\n").writerows((columns, *rows))
+    return text.getvalue()
+
+
+def _write_rows(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
+    write_whole(path, csv_text((f.name for f in fields(kind)), map(astuple, rows)).encode())
 
 
 def _from_csv(kind: type[Row], path: Path) -> list[Row]:

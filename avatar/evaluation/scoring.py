@@ -6,22 +6,22 @@ import functools
 import logging
 import zlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 
 from avatar.checks import AvatarError, DataError
-from avatar.evaluation.comparison import Comparison
-from avatar.evaluation.metrics import METRICS, Metric, find_metrics
+from avatar.data.outfits import Outfit
+from avatar.evaluation.metrics import METRIC_NAMES, Comparison, Metric, find_metrics
 from avatar.evaluation.scores import FrameScore, Score, Scores
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.progress import tracked
-from avatar.records import Frame, Mesh, PointCloud, Scan
+from avatar.records import Frame, Mesh, Scan
 
 log = logging.getLogger(__name__)
 
@@ -29,23 +29,6 @@ log = logging.getLogger(__name__)
 # plots are made of scores, nor how what is scored was trained: that shows in the hash of the prediction's file.
 SOURCE = ("avatar.evaluation.floors", "avatar.data.layouts")
 SIZE_RATIO = 5.0  # a prediction this many times larger or smaller than its scan is in other units
-
-
-class Outfit(Protocol):
-    """What scoring asks of a dataset's outfit.
-
-    It may also have ``template`` (with ``faces``), which penetration and the body floor need, and
-    ``resample(split, name, points, seed) -> Scan``, a fresh sampling of the true surface for the sampling floor.
-    """
-
-    name: str
-    dataset: str
-
-    def frames(self, split: str) -> Sequence[str]:
-        """Names of the frames of a split."""
-
-    def load(self, split: str, name: str) -> Frame:
-        """One frame."""
 
 
 @dataclass
@@ -56,7 +39,7 @@ class ScoreConfig:
     """
 
     scan_points: int = 40_000  # scan points compared a frame; all of them where a scan has fewer
-    metrics: list[str] = field(default_factory=lambda: list(METRICS))
+    metrics: list[str] = field(default_factory=lambda: list(METRIC_NAMES))
     seed: int = 0
     motion: bool = False  # frames follow each other in time and predictions keep point order: adds jitter
 
@@ -98,9 +81,8 @@ class Memory:
             return {}, 0
         key = self.made_of(frame)
         found = {metric: self.ledger.find(f"{self.what}/{frame}/{metric}", key) for metric in metrics}
-        found = {metric: note for metric, note in found.items() if note}
-        points = max((note["points"] for note in found.values()), default=0)
-        return {metric: note["value"] for metric, note in found.items()}, points
+        points = max((note["points"] for note in found.values() if note), default=0)
+        return {metric: note["value"] for metric, note in found.items() if note}, points
 
     def note(self, frame: str, values: dict[str, float], points: int) -> None:
         """Writes a frame's values down."""
@@ -132,7 +114,7 @@ def remember(ledger: Ledger | None, what: str, outfit: Any, split: str, source: 
 def remember_scores(
     ledger: Ledger | None, what: str, outfit: Any, split: str, config: ScoreConfig, **made: Any
 ) -> Memory:
-    """The memory of scores of points; none for motion, whose frames hang together."""
+    """The memory of scores of points; none for motion, whose frames depend on each other."""
     drawn = {"scan_points": config.scan_points, "seed": config.seed}
     return remember(None if config.motion else ledger, what, outfit, split, SOURCE, **drawn, **made)
 
@@ -150,7 +132,8 @@ def score_predictions(
 
     Args:
         folder: the predictions. Files that belong to no frame are ignored with a warning.
-        outfit: where the true frames come from.
+        outfit: where the true frames come from: its ``name``, ``dataset``, `frames` and `load`; penetration is
+            scored where it has a ``template``.
         split: which of its splits.
         config: metrics and point counts.
         label: method, variant and training facts for the rows.
@@ -163,7 +146,7 @@ def score_predictions(
 
     Raises:
         DataError: when frames have no prediction (naming them), or one is in other units than its scan.
-        AvatarError: naming the frame, when a prediction is not sound.
+        AvatarError: naming the frame, when a prediction is not valid.
     """
     names = frame_names(outfit, split)
     clouds = find_predictions(Path(folder), names, (".ply",))
@@ -172,7 +155,11 @@ def score_predictions(
     def compare(frame: Frame) -> Comparison:
         path = clouds[frame.name]
         prediction, scan = read_points(path), draw_scan(frame, config)
-        _check_size(path, prediction, scan)
+        sizes = [np.ptp(cloud.points, axis=0).max() for cloud in (prediction, scan)]
+        ratio = sizes[0] / max(float(sizes[1]), 1e-12)
+        if not 1 / SIZE_RATIO < ratio < SIZE_RATIO:
+            expected = "expected a prediction about as large as its scan"
+            raise DataError(path, f"{expected}, got {ratio:.3g} times its size.", "Use metres.")
         mesh = read_mesh(surfaces[frame.name]) if surfaces else None
         return Comparison(prediction, scan, posed_body(outfit, frame), mesh)
 
@@ -241,14 +228,6 @@ def find_predictions(folder: Path, names: Sequence[str], suffixes: tuple[str, ..
 def _some(names: Iterable[str]) -> str:
     names = list(names)
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-def _check_size(path: Path, prediction: PointCloud, scan: Scan) -> None:
-    ratio = np.ptp(prediction.points, axis=0).max() / max(float(np.ptp(scan.points, axis=0).max()), 1e-12)
-    if not 1 / SIZE_RATIO < ratio < SIZE_RATIO:
-        raise DataError(
-            path, f"expected a prediction about as large as its scan, got {ratio:.3g} times its size.", "Use metres."
-        )
 
 
 def score_frames(
@@ -320,23 +299,7 @@ def mean_scores(
     for metric in metrics:
         values = [frame.value for frame in frames if frame.metric == metric.name]
         if values:
-            rows.append(
-                Score(
-                    table=label.table,
-                    outfit=frames[0].outfit,
-                    method=label.method,
-                    variant=label.variant,
-                    metric=metric.name,
-                    value=float(np.mean(values)),
-                    unit=metric.unit,
-                    frames=len(values),
-                    seed=label.seed,
-                    steps=label.steps,
-                    seconds=label.seconds,
-                    points=points,
-                    commit=label.commit,
-                    dataset=dataset,
-                    fraction=label.fraction,
-                )
-            )
+            number = {"metric": metric.name, "value": float(np.mean(values)), "unit": metric.unit}
+            where = {"outfit": frames[0].outfit, "dataset": dataset, "frames": len(values), "points": points}
+            rows.append(Score(**asdict(label), **number, **where))
     return rows

@@ -22,10 +22,8 @@ def in_chunks(work: Callable[[slice], Part], count: int, size: int) -> list[Part
 
     Chunks have ``size`` rows until memory runs out; from then on half as many. All are multiples of 1024 rows, but for
     what is left over, which comes last and by itself. For a function that treats every row by itself the joined result
-    is then the same whatever the size: on the CPU to the bit, with a number of threads that is a power of two.
-
-    Raises:
-        AvatarError: when not even 1024 rows fit.
+    is then the same whatever the size: on the CPU to the bit, with a number of threads that is a power of two. Raises
+    `AvatarError` when not even 1024 rows fit.
     """
     size, even = max(UNIT, size // UNIT * UNIT), count // UNIT * UNIT
     parts: list[Part] = []

@@ -2,25 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from torch import Tensor
 
 from avatar.checks import check_shape
-from avatar.geometry.neighbours import nearest_both_ways
-
-
-@dataclass(frozen=True)
-class Correspondences:
-    """Nearest neighbours both ways: ``scan_of_point (B, N)`` and ``point_of_scan (B, M)``, int64, no gradient."""
-
-    scan_of_point: Tensor
-    point_of_scan: Tensor
-
-
-def correspond(points: Tensor, scan: Tensor) -> Correspondences:
-    """Nearest neighbours between predicted points ``(B, N, 3)`` and scan points ``(B, M, 3)``, both ways."""
-    return Correspondences(*nearest_both_ways(points, scan))
 
 
 def point_to_point(points: Tensor, anchors: Tensor) -> Tensor:
@@ -31,18 +15,10 @@ def point_to_point(points: Tensor, anchors: Tensor) -> Tensor:
 
 
 def point_to_plane(points: Tensor, anchors: Tensor, normals: Tensor) -> Tensor:
-    """Squared distance from each point to the tangent plane at its anchor.
+    """Squared distance of each point to the tangent plane at its anchor. ``(B, N, 3)`` thrice to ``(B, N)``, m^2.
 
-    With nearest scan points as anchors this approximates squared point-to-surface
-    distance and does not penalise sliding along the cloth (POP's prediction-to-scan term).
-
-    Args:
-        points: ``(B, N, 3)`` predicted points, metres.
-        anchors: ``(B, N, 3)`` one scan point per predicted point, metres.
-        normals: ``(B, N, 3)`` unit normals at the anchors.
-
-    Returns:
-        ``(B, N)`` squared distances, square metres, not reduced.
+    With nearest scan points as anchors this approximates squared point-to-surface distance and does not penalise
+    sliding along the cloth (POP's prediction-to-scan term).
     """
     dims = check_shape("points", points, "B N 3")
     check_shape("anchors", anchors, "B N 3", **dims)

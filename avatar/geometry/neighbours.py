@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
@@ -26,24 +27,14 @@ def nearest(queries: Tensor, points: Tensor) -> Tensor:
 
 @torch.no_grad()
 def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
-    """Indices of the k nearest points to each query, nearest first.
+    """Indices of k nearest points to each query, nearest first: ``(B, N, 3)``, ``(B, M, 3)`` to ``(B, N, k)`` int64.
 
     Exact on every device: distances are sums of squared differences, never the expanded product form, which
     picks a wrong neighbour for near ties. Among points at the same distance any may come, the same each time.
 
     Coordinates that are not finite are refused on the CPU. On a device looking for them would stall the stream, so
     they pass through: the indices stay in range and the distances taken with them are NaN, for the loss to show.
-
-    Args:
-        queries: ``(B, N, 3)``.
-        points: ``(B, M, 3)`` with ``M >= k``.
-        k: neighbours a query.
-
-    Returns:
-        ``(B, N, k)`` int64.
-
-    Raises:
-        AvatarError: on wrong shapes, non-finite coordinates (CPU), k below 1 or fewer than k points.
+    Raises `AvatarError` on wrong shapes, non-finite coordinates (CPU), k below 1 or fewer than k points.
     """
     dims = check_shape("queries", queries, "B N 3")
     dims = check_shape("points", points, "B M 3", B=dims["B"])
@@ -52,42 +43,38 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
     if queries.device.type != "cpu":
         return _k_nearest_on_device(queries, points, k)
     pairs = zip(queries.double().numpy(), points.double().numpy())
-    return torch.stack([_ask(build_tree(cloud), query, k) for query, cloud in pairs])
+    return torch.stack([_query(build_tree(cloud), query, k) for query, cloud in pairs])
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Nearest neighbours both ways: ``scan_of_point (B, N)`` and ``point_of_scan (B, M)``, int64, no gradient."""
+
+    scan_of_point: Tensor
+    point_of_scan: Tensor
 
 
 @torch.no_grad()
-def nearest_both_ways(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
-    """What `nearest` gives for points in others and for others in points, faster on the CPU.
+def correspond(points: Tensor, scan: Tensor) -> Correspondences:
+    """What `nearest` gives for points ``(B, N, 3)`` in a scan ``(B, M, 3)`` and the other way, faster on the CPU.
 
-    A tree keeps its points in an order in which neighbours follow each other; asked about in that order, the other
-    tree's branches stay in the processor's cache. Clouds are shared out among threads whole, so trees are built side by
-    side, too. Among points at the same distance another may come.
-
-    Args:
-        points: ``(B, N, 3)``; others: ``(B, M, 3)``.
-
-    Returns:
-        ``(B, N)`` and ``(B, M)`` int64.
-
-    Raises:
-        AvatarError: as `k_nearest`.
+    A tree keeps its points in an order in which neighbours follow each other; queried in that order, the other tree's
+    branches stay in the processor's cache. Trees are built side by side, each cloud by one thread. Among points at the
+    same distance another may come than from `nearest`. Raises `AvatarError` as `k_nearest`.
     """
     dims = check_shape("points", points, "B N 3")
-    check_shape("others", others, "B M 3", B=dims["B"])
-    if points.device.type != "cpu" or not (points.shape[1] and others.shape[1]):
-        return nearest(points, others), nearest(others, points)
-    clouds = [cloud.double().numpy() for batch in (points, others) for cloud in batch]
+    check_shape("scan", scan, "B M 3", B=dims["B"])
+    if points.device.type != "cpu" or not (points.shape[1] and scan.shape[1]):
+        return Correspondences(nearest(points, scan), nearest(scan, points))
+    clouds = [cloud.double().numpy() for batch in (points, scan) for cloud in batch]
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # scipy lets go of Python's lock
         trees = list(pool.map(build_tree, clouds))
-        found = list(pool.map(_ask_in_order, trees, trees[len(points) :] + trees[: len(points)]))
-    return torch.stack(found[: len(points)]), torch.stack(found[len(points) :])
+        found = list(pool.map(_query_in_order, trees, trees[len(points) :] + trees[: len(points)]))
+    return Correspondences(torch.stack(found[: len(points)]), torch.stack(found[len(points) :]))
 
 
 class FixedPoints:
-    """Points ``(M, 3)`` that stay the same, to be searched many times: their tree is built once, at the first search.
-
-    For what `k_nearest` would build anew at each call, such as the vertices of a body at rest.
-    """
+    """Points ``(M, 3)`` that stay the same, such as a body at rest: their tree is built once, at the first search."""
 
     def __init__(self, points: Tensor):
         check_shape("points", points, "M 3")
@@ -101,15 +88,14 @@ class FixedPoints:
     def k_nearest(self, queries: Tensor, k: int) -> Tensor:
         """Indices ``(..., k)`` int64 of the k nearest points to queries ``(..., 3)`` on any device, nearest first.
 
-        Raises:
-            AvatarError: as `avatar.geometry.neighbours.k_nearest`.
+        Raises `AvatarError` as `avatar.geometry.neighbours.k_nearest`.
         """
         check_shape("queries", queries, "... 3")
         if not 1 <= k <= len(self.points):
             raise AvatarError(f"k, points: expected k of 1 to the {len(self.points)} points, got {k}.")
         flat = queries.reshape(-1, 3)
         if queries.device.type == "cpu":
-            found = _ask(self._tree, flat.double().numpy(), k)
+            found = _query(self._tree, flat.double().numpy(), k)
         else:
             self.points = self.points.to(queries.device)
             found = _k_nearest_on_device(flat[None], self.points[None], k)[0]
@@ -128,8 +114,8 @@ def _k_nearest_on_device(queries: Tensor, points: Tensor, k: int) -> Tensor:
 def try_fused(queries: Tensor, points: Tensor) -> Tensor | None:
     """`kernels.nearest_fused`; None, with one warning for each kind of error, where Triton fails.
 
-    CUDA builds of torch bring Triton along, but it needs a C compiler, too. What fails once, for want of memory or on
-    a busy file system, is tried again at the next call; only where there is no Triton at all nothing is tried.
+    CUDA builds of torch include Triton, but it needs a C compiler, too. What fails once, such as for want of memory, is
+    tried again at the next call.
     """
     search = fused_search()
     try:
@@ -157,7 +143,7 @@ def warn_slow(kind: str, reason: str) -> None:
         report.warning("Nearest neighbours on CUDA go the slow way, for Triton failed (%s: %s).", kind, reason)
 
 
-def _ask(tree: Tree, queries: np.ndarray, k: int) -> Tensor:
+def _query(tree: Tree, queries: np.ndarray, k: int) -> Tensor:
     """Indices ``(N, k)`` of the nearest points of a tree to finite queries."""
     try:
         _, ids = tree.query(queries, k=k, workers=torch.get_num_threads())
@@ -166,8 +152,8 @@ def _ask(tree: Tree, queries: np.ndarray, k: int) -> Tensor:
     return torch.from_numpy(ids).reshape(len(queries), k).long()
 
 
-def _ask_in_order(tree: Tree, other: Tree) -> Tensor:
-    """Indices ``(N,)`` of the nearest points of the other tree to this tree's points, asked in this tree's order."""
+def _query_in_order(tree: Tree, other: Tree) -> Tensor:
+    """Indices ``(N,)`` of the nearest points of the other tree to this tree's points, queried in this tree's order."""
     ids = torch.empty(tree.n, dtype=torch.long)
     ids[tree.indices] = torch.from_numpy(other.query(tree.data[tree.indices])[1])
     return ids
@@ -188,13 +174,8 @@ def _k_nearest_chunked(queries: Tensor, points: Tensor, k: int) -> Tensor:
 def ball_query(centres: Tensor, points: Tensor, radius: float, k: int) -> Tensor:
     """Up to k nearest points within a radius of each centre; short lists repeat their nearest point.
 
-    Meant for a constant template: called once, its result cached (CloSET 4, network architecture).
-
-    Args:
-        centres: ``(S, 3)``; points: ``(N, 3)``; radius: metres; k: group size.
-
-    Returns:
-        ``(S, k)`` int64. A centre with no point in reach gets its nearest point k times.
+    For a constant template, called once (CloSET 4, network architecture). ``(S, 3)`` and ``(N, 3)``, metres, to
+    ``(S, k)`` int64. A centre with no point in reach gets its nearest point k times.
     """
     check_shape("centres", centres, "S 3")
     check_shape("points", points, "N 3")

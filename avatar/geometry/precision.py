@@ -19,13 +19,10 @@ def widen(value: Any) -> Any:
 
 
 def full_precision(function: Callable[..., Result]) -> Callable[..., Result]:
-    """Has a function of tensors, or a network's method, compute in float32 or wider under autocast, too.
+    """Has a function with tensors among its positional arguments compute in float32 or wider under autocast, too.
 
     For layers that are linear in positions: a later difference or normalisation removes most of a position, and what
     is left of it must not be rounding.
-
-    Args:
-        function: with a tensor among its positional arguments.
     """
 
     @wraps(function)

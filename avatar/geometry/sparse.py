@@ -1,8 +1,8 @@
-"""Weighted sums of a few rows each: what gathers from a mesh or a hierarchy, and its transpose, which scatters back.
+"""Sparse weighted gathers from the rows of a mesh or a hierarchy, and their transposes, which scatter back.
 
 Autograd's own backward pass of a gather adds row by row: slowly on the CPU, where the order may depend on threads, and
-by atomic additions on CUDA, where it is another one each time. The transpose of a table is a table again, so both
-directions are the same fast sum, and no order of additions depends on chance.
+by atomic additions on CUDA, in another order each time. The transpose of a table is a table again, so both directions
+are the same fast, repeatable sum.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class SparseRows:
         return cls(ids.flatten(), starts, weights, rows)
 
     def transpose(self) -> SparseRows:
-        """The transposed map: it takes a row for every bag and has a bag for every row."""
+        """The transposed map: it takes a row for every sum and has a sum for every row."""
         order = self.ids.argsort(stable=True)
         places = torch.arange(self.rows, device=order.device)
         members = torch.searchsorted(self.starts, order, right=True) - 1
@@ -74,12 +74,9 @@ class _GatherSum(torch.autograd.Function):
 
 
 def gather_sum(values: Tensor, sparse: SparseRows, back: SparseRows | None = None) -> Tensor:
-    """Sums of sparse of rows, ``(..., V, C)`` to ``(..., R, C)``; differentiable in the values.
+    """Weighted sums of rows, ``(..., V, C)`` to ``(..., R, C)``; differentiable in the values.
 
-    Args:
-        values: any number of arrays of rows.
-        sparse: which rows, with which weights.
-        back: ``sparse.transpose()``, where it is at hand; else the backward pass makes it.
+    ``back`` is ``sparse.transpose()``, which the backward pass makes where it is not given.
     """
     check_shape("values", values, "... V C", V=sparse.rows)
     summed = _GatherSum.apply(values.reshape(-1, *values.shape[-2:]), sparse, back)

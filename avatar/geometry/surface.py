@@ -1,11 +1,11 @@
-"""Triangle surfaces: areas, normals, sampling, barycentric interpolation."""
+"""Triangle surfaces and their points: areas, normals, sampling, barycentric interpolation."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from avatar.checks import AvatarError, check_shape
+from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.sparse import SparseRows, gather_sum
 from avatar.records import SurfaceSamples
 
@@ -33,19 +33,11 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def sample_surface(vertices: Tensor, faces: Tensor, count: int, generator: torch.Generator) -> SurfaceSamples:
-    """Points spread over a surface with uniform expected density, without any UV map.
+    """Points on a surface ``(V, 3)``, ``(F, 3)`` with uniform expected density, without any UV map.
 
-    Stratified over the cumulative area: every stretch of the surface gets its share of points to within one,
-    so the spread is more even than that of independent draws.
-
-    Args:
-        vertices: ``(V, 3)`` metres.
-        faces: ``(F, 3)``.
-        count: number of points, at least 1.
-        generator: CPU random state; the same state gives the same samples.
-
-    Raises:
-        AvatarError: when the surface has no area or ``count`` is not positive.
+    Stratified over the cumulative area: every part of the surface gets its share of points to within one, so they are
+    more even than independent draws. The same state of the CPU's ``generator`` gives the same samples. Raises
+    `AvatarError` when the surface has no area or ``count`` is not positive.
     """
     check_shape("vertices", vertices, "V 3")
     if count < 1:
@@ -76,5 +68,29 @@ def interpolate(values: Tensor, samples: SurfaceSamples) -> Tensor:
 
 
 def interpolate_transforms(transforms: Tensor, samples: SurfaceSamples) -> Tensor:
-    """Barycentric blend of per-vertex transforms, as POP blends vtransf. ``(..., V, 4, 4)`` to ``(..., N, 4, 4)``."""
+    """Barycentric blend of per-vertex matrices, as POP blends vtransf. ``(..., V, D, D)`` to ``(..., N, D, D)``."""
     return interpolate(transforms.flatten(-2), samples).unflatten(-1, transforms.shape[-2:])
+
+
+@torch.no_grad()
+def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
+    """Indices ``(count,)`` of a subset of points ``(N, 3)``, each the farthest from all before it (PointNet++).
+
+    The first is ``start``, so the same points give the same subset. No index comes twice, not even where points
+    coincide. O(N count): call it once on a constant template. Raises `AvatarError` for a count or start out of range,
+    or coordinates that are not finite.
+    """
+    dims = check_shape("points", points, "N 3")
+    if not 1 <= count <= dims["N"]:
+        raise AvatarError(f"count: expected 1 to {dims['N']} points, got {count}.")
+    if not 0 <= start < dims["N"]:
+        raise AvatarError(f"start: expected an index in [0, {dims['N']}), got {start}.")
+    check_finite("points", points)
+    chosen = torch.empty(count, dtype=torch.long, device=points.device)
+    distances = torch.full((dims["N"],), torch.inf, dtype=points.dtype, device=points.device)
+    chosen[0] = start
+    for i in range(1, count):
+        distances = torch.minimum(distances, (points - points[chosen[i - 1]]).square().sum(dim=-1))
+        distances[chosen[i - 1]] = -1  # below every distance: not chosen again
+        chosen[i] = distances.argmax()
+    return chosen

@@ -30,16 +30,10 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def relative_quaternions(joint_transforms: Tensor, parents: Sequence[int]) -> Tensor:
-    """Each joint's turn against its parent, but the root's, as the unit quaternion (x, y, z, w) with w of at least 0.
+    """Rotations of all joints but the root against their parents, as unit quaternions (x, y, z, w), w at least 0.
 
-    Needs no pose parameters and does not change with the body's place and heading.
-
-    Args:
-        joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
-        parents: J indices, -1 for the root.
-
-    Returns:
-        ``(B, J - 1, 4)``.
+    ``(B, J, 4, 4)`` posed_from_canonical and J parents, -1 for the root, to ``(B, J - 1, 4)``. Needs no pose parameters
+    and does not change with the body's place and heading.
     """
     import roma
 
@@ -84,10 +78,8 @@ def rotation_between(source: Tensor, target: Tensor) -> Tensor:
     """The smallest rotation that turns one direction onto another. ``(3,)`` each, to ``(3, 3)``.
 
     Opposite directions have many such half turns: the one about a perpendicular nearest a coordinate axis is given.
-    Worked out in float64, so that directions a hair from parallel keep their axis.
-
-    Raises:
-        AvatarError: for a direction of no length.
+    Worked out in float64, so that directions a hair from parallel keep their axis. Raises `AvatarError` for a direction
+    of no length.
     """
     check_shape("source", source, "3")
     check_shape("target", target, "3")

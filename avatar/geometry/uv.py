@@ -11,7 +11,7 @@ from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.surface import interpolate
 from avatar.records import SurfaceSamples
 
-INSIDE = 1e-12  # how far below zero rounding may carry a barycentric coordinate of a point on an edge
+INSIDE = 1e-12  # how far below zero rounding may take a barycentric coordinate of a point on an edge
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,7 @@ class UVGrid:
 def check_atlas(uv: Tensor, uv_faces: Tensor, faces: int) -> None:
     """Refuses UV coordinates ``(U, 2)`` and corner indices ``(F, 3)`` that do not belong together.
 
-    Raises:
-        AvatarError: naming what is missing, of another shape, not finite or out of range.
+    Raises `AvatarError` naming what is missing, of another shape, not finite or out of range.
     """
     check_shape("uv", uv, "U 2")
     check_shape("uv_faces", uv_faces, "F 3", F=faces)
@@ -46,15 +45,9 @@ def rasterise_uv(uv: Tensor, uv_faces: Tensor, faces: Tensor, size: int) -> UVGr
 
     Pixel (row, column) has its centre at ``u = (column + 1/2) / size``, ``v = (row + 1/2) / size``, which is also
     where ``grid_sample`` with ``align_corners=False`` places it. It belongs to the triangle that holds its centre,
-    borders included; to that with the lowest index where there are several.
-
-    Args:
-        uv: ``(U, 2)`` in [0, 1]; uv_faces: ``(F, 3)`` indices into it.
-        faces: ``(F, 3)`` the same triangles' vertices on the surface.
-        size: pixels a side.
-
-    Raises:
-        AvatarError: for coordinates out of [0, 1], a size below 1, or an atlas that covers no pixel.
+    borders included; to that with the lowest index where there are several. ``uv (U, 2)`` are in [0, 1], ``uv_faces``
+    and ``faces (F, 3)`` a triangle's corners in the atlas and on the surface. Raises `AvatarError` for coordinates out
+    of [0, 1], a size below 1, or an atlas that covers no pixel.
     """
     check_atlas(uv, uv_faces, check_shape("faces", faces, "F 3")["F"])
     if size < 1:
@@ -126,8 +119,7 @@ def paint(values: Tensor, grid: UVGrid) -> Tensor:
 def seam_edges(faces: Tensor, uv_faces: Tensor) -> Tensor:
     """Edges ``(E, 2)`` of a mesh along which its atlas is cut, vertex ids rising: where POP's features jump.
 
-    An edge is cut when the triangles at its sides have it at different places in the atlas. Borders of the mesh
-    itself are not seams.
+    The triangles at their sides have them at different places in the atlas. Borders of the mesh are not seams.
     """
     check_shape("uv_faces", uv_faces, "F 3", **check_shape("faces", faces, "F 3"))
     edges = torch.cat([faces[:, [i, (i + 1) % 3]] for i in range(3)])

@@ -1,7 +1,6 @@
-"""Interface of a method: how its network is built, trained, rebuilt from a file, and asked for a dressed surface.
+"""Interface of a method of any kind (points, implicit surface, mesh): one file in this folder, with a `Method` in it.
 
-A method of any kind (points, implicit surface, mesh) is one file in this folder with a `Method` at its end. Trainer,
-prediction, meshing, evaluation and reports know this interface and no method by name.
+Trainer, prediction, meshing, evaluation and reports know this interface and no method by name.
 """
 
 from __future__ import annotations
@@ -9,15 +8,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.methods.losses import LossConfig
-from avatar.methods.settings import RunConfig
-from avatar.records import Batch, BodyFit, LossTerms, PointCloud, Surface, SurfaceSamples, Template
+from avatar.methods.settings import FitConfig, RunConfig
+from avatar.records import Batch, BodyFit, LossTerms, PointCloud, SurfaceSamples, Template
 
 Inputs = tuple[Any, ...]  # dataclasses of tensors; the first has the ``names`` of its frames
 SEED_STRIDE = 1_000_003  # between the seeds of a run's ranks and tasks, so that a step's draw is that of no other run
@@ -103,24 +101,10 @@ class TrainedAvatar:
     seconds: float
 
     def outfit_index(self, name: str) -> int:
-        """Index of an outfit among those the avatar was trained on.
-
-        Raises:
-            AvatarError: for an outfit it was not trained on, naming those it was.
-        """
+        """Index of an outfit among those the avatar was trained on; raises `AvatarError` for any other."""
         if name not in self.config.outfit:
             raise AvatarError(f"outfit: this avatar was trained on {', '.join(self.config.outfit)}, not on {name!r}.")
         return self.config.outfit.index(name)
-
-
-class FitOptions(Protocol):
-    """Options of fitting a garment code: Adam's steps and rate, template points and their seed, loss weights."""
-
-    steps: int
-    code_lr: float
-    points: int
-    seed: int
-    loss: LossConfig
 
 
 class Method(ABC):
@@ -145,8 +129,7 @@ class Method(ABC):
     def check(self, run: RunConfig, settings: Any) -> None:  # noqa: B027 (nothing to check by default)
         """Check a run before its data are read.
 
-        Raises:
-            AvatarError: for a run that the method cannot train, such as several outfits where it takes one.
+        Raises `AvatarError` for a run that the method cannot train, such as several outfits where it takes one.
         """
 
     def needs(self, run: RunConfig, settings: Any) -> frozenset[str]:
@@ -157,8 +140,7 @@ class Method(ABC):
     def prepare(self, run: RunConfig, settings: Any, template: Template) -> Task:
         """An untrained network with its data and loss, on the run's device.
 
-        Raises:
-            DataError: when something the method needs is missing, naming the command that makes it.
+        Raises `DataError` when something the method needs is missing, naming the command that makes it.
         """
 
     @abstractmethod
@@ -170,22 +152,14 @@ class Method(ABC):
         return {}
 
     @abstractmethod
-    def rebuild(
-        self, settings: Any, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping[str, Tensor]
-    ) -> nn.Module:
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
         """The network of a finished run, its weights still to be loaded."""
 
     @abstractmethod
-    def predictor(
-        self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
-    ) -> Callable[[BodyFit], Surface]:
-        """A function that dresses posed bodies.
+    def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
+        """A function from a `BodyFit` to its dressed `Surface`, in one of the avatar's outfits.
 
-        Args:
-            avatar: a trained avatar of this method.
-            outfit: one of those it was trained on.
-            points: points a frame, 1,000 to 400,000.
-            surface: resolution of an implicit surface.
+        ``points`` a frame are 1,000 to 400,000; ``surface`` is the resolution of an implicit surface.
         """
 
     def prediction_settings(self, points: int, surface: ExtractionConfig) -> dict[str, Any]:
@@ -195,8 +169,7 @@ class Method(ABC):
     def predict_at(self, avatar: TrainedAvatar, outfit: str, body: BodyFit, samples: SurfaceSamples) -> PointCloud:
         """The dressed surface at chosen places of the body (``on_body`` methods).
 
-        Raises:
-            AvatarError: for a method that has no points there.
+        Raises `AvatarError` for a method that has no points there.
         """
         raise AvatarError(f"method: expected one with points at chosen places of the body, got {self.name}.")
 
@@ -206,13 +179,10 @@ class Method(ABC):
         """The explicit garment template, skinned to a body or in the canonical pose; None for a method without one."""
         return None
 
-    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
+    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         """The garment code of an unseen outfit from one scan, for a method with one code an outfit.
 
-        Raises:
-            AvatarError: for a method without codes.
+        Raises `AvatarError` for a method without codes.
         """
-        raise AvatarError(
-            f"run: expected a method with a garment code for each outfit, got {self.name}. Hint: train the new outfit "
-            "by itself."
-        )
+        problem = f"run: expected a method with a garment code for each outfit, got {self.name}."
+        raise AvatarError(f"{problem} Hint: train the new outfit by itself.")

@@ -1,7 +1,4 @@
-"""SCANimate's canonicalizer: skinning fields learned from posed scans in two stages, and the weights they give.
-
-First the fields apart, then together through the cycle; the code of a frame that was not trained on is fitted.
-"""
+"""SCANimate's canonicalizer: skinning fields learned from posed scans, first apart, then together through the cycle."""
 
 from __future__ import annotations
 
@@ -9,12 +6,11 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from avatar.body.packed import read_template
 from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
@@ -31,6 +27,7 @@ from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
+from avatar.implicit.body_field import BodyField
 from avatar.invocation import command_line
 from avatar.io.building import building
 from avatar.io.checkpoints import read_weights
@@ -73,9 +70,8 @@ class CycleConfig:
             if getattr(self, name) < 1:
                 raise AvatarError(f"{name}: expected at least 1, got {getattr(self, name)}.")
         if self.second_steps < 0 or (self.clip is not None and self.clip <= 0):
-            raise AvatarError(
-                f"second_steps: expected at least 0, clip: above 0; got {self.second_steps}, {self.clip}."
-            )
+            problem = f"second_steps: expected at least 0, clip: above 0; got {self.second_steps}, {self.clip}."
+            raise AvatarError(problem)
         if self.minutes is not None and self.minutes <= 0:
             raise AvatarError(f"minutes: expected above 0 or null, got {self.minutes}.")
         if min(self.first_lr, self.second_lr, self.code_lr) <= 0 or not 0 < self.decay <= 1:
@@ -90,6 +86,10 @@ class CycleConfig:
     def steps(self) -> int:
         """Both stages' steps."""
         return self.first_steps + self.second_steps
+
+    def rate_factor(self, step: int, progress: float) -> float:
+        """The learning rate's factor at a share of a stage: it falls at half and at three quarters."""
+        return self.decay ** ((progress >= 0.5) + (progress >= 0.75))
 
 
 class CanonicalizerTask(Task):
@@ -113,20 +113,16 @@ class CanonicalizerTask(Task):
         self.frames, self.batch = len(scans), config.batch
         self.groups = (list(model.parameters()),)
         plan = ((config.first_steps, config.first_lr), (config.second_steps, config.second_lr))
-        decay = partial(rate_factor, decay=config.decay)
-        self.stages = tuple(
-            Stage(steps / config.steps, (rate,), lambda _, progress: decay(progress)) for steps, rate in plan if steps
-        )
+        self.stages = tuple(Stage(steps / config.steps, (rate,), config.rate_factor) for steps, rate in plan if steps)
 
     def inputs_at(self, step: int) -> tuple[ScanBatch]:
-        """The points of a step."""
         places = torch.arange(step * self.config.batch, (step + 1) * self.config.batch)
         frames = [self.frame_at(int(place)) for place in places]
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + step)
         return (draw_batch(self.scans, frames, self.weights, self.config.draw, generator),)
 
     def frame_at(self, place: int) -> int:
-        """The scan at a place in the endless sequence of epochs, each of which is a permutation of them all."""
+        """The scan at a place in the endless sequence of epochs, each a permutation of all scans."""
         epoch, offset = divmod(place, len(self.scans))
         generator = torch.Generator().manual_seed((self.config.seed + 1) * SEED_STRIDE + epoch)
         return int(torch.randperm(len(self.scans), generator=generator)[offset])
@@ -139,28 +135,16 @@ class CanonicalizerTask(Task):
         return canonicalization_loss(cycle, batch, self.nearest, self.config.loss, progress)
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:
-        """The objective and the cycle's distance, millimetres."""
         return super().shown(values) | {"cycle": f"{1e3 * values.get('cycle_points', 0):.1f}mm"}
 
     def frame_names(self, inputs: Inputs) -> tuple[str, ...]:
-        """The names of a step's scans."""
         return tuple(self.names[frame] for frame in inputs[0].frames.tolist())
 
 
-def rate_factor(progress: float, decay: float) -> float:
-    """The learning rate's factor at a share of a stage: it falls at half and at three quarters."""
-    return decay ** ((progress >= 0.5) + (progress >= 0.75))
-
-
 def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start: Tensor, config: CycleConfig) -> Tensor:
-    """Fit the code ``(L,)`` of a frame that was not trained on, with frozen networks (auto-decoding).
+    """Fits the code ``(L,)`` of a frame that was not trained on, with frozen networks (auto-decoding).
 
-    Args:
-        model: a trained canonicalizer with codes.
-        template: the body at rest.
-        scan: the frame.
-        start: ``(L,)`` where to begin: the code of a learned frame in a similar pose.
-        config: steps, rate, points and loss weights.
+    ``start (L,)`` is the code of a learned frame in a similar pose; ``template`` the body at rest.
     """
     if model.config.latent is Latent.pose:
         return scan.pose.to(start)
@@ -168,7 +152,7 @@ def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start:
     nearest, weights = NearestWeights(template, code.device), template.weights.cpu()
     optimiser = torch.optim.Adam([code], lr=config.code_lr)
     for step in range(config.code_steps):
-        optimiser.param_groups[0]["lr"] = config.code_lr * rate_factor(step / config.code_steps, config.decay)
+        optimiser.param_groups[0]["lr"] = config.code_lr * config.rate_factor(step, step / config.code_steps)
         generator = torch.Generator().manual_seed(config.seed * SEED_STRIDE + step)
         batch = draw_batch([scan], [0], weights, config.draw, generator).to(code.device)
         cycle = model(batch, code[None], together=True)
@@ -216,7 +200,7 @@ class CanonicalizeConfig:
     @property
     def folder(self) -> Path:
         """Where the run lives: ``<runs>/canonical/<dataset>/<outfit>/<name>``."""
-        return self.runs_root / "canonical" / self.dataset / self.outfit / self.name
+        return self.runs_root / CANONICALIZERS / self.dataset / self.outfit / self.name
 
     def find_outfit(self) -> Outfit:
         """The outfit on disk."""
@@ -249,7 +233,7 @@ class TrainedCanonicalizer:
 
     @property
     def forward_field(self) -> SkinningField:
-        """WeightSource weights of canonical space: frozen, differentiable in the points."""
+        """Skinning weights of canonical space: frozen, differentiable in the points."""
         return copy.deepcopy(self.model.forward_field).eval().requires_grad_(False)
 
     def code_of(self, frame: Frame) -> Tensor:
@@ -275,8 +259,7 @@ class TrainedCanonicalizer:
 def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicalizer:
     """The trained canonicalizer of a run's folder.
 
-    Raises:
-        DataError: when the folder is no finished run of learned weights, or a file in it is damaged.
+    Raises `DataError` when the folder is no finished run of learned weights, or a file in it is damaged.
     """
     if not (folder / f"{WEIGHTS}.json").is_file():
         hint = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
@@ -287,17 +270,26 @@ def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicaliz
         template, poses = read_template(folder / "template.npz"), weights.pop(POSES)
         model = Canonicalizer(template, len(facts["frames"]), config.canonicalizer)
         model.load_state_dict(weights)
-    model = model.to(choose_device(device)).eval().requires_grad_(False)
-    return TrainedCanonicalizer(
-        model, template, config, tuple(facts["frames"]), poses, facts["steps"], facts["seconds"]
-    )
+    model, frames = model.to(choose_device(device)).eval().requires_grad_(False), tuple(facts["frames"])
+    return TrainedCanonicalizer(model, template, config, frames, poses, facts["steps"], facts["seconds"])
+
+
+def find_field(folder: Path, template: Template) -> nn.Module:
+    """The forward skinning field of a checked run: the learned one, or the body's for its baselines (nearest, knn).
+
+    Both are posed by the six nearest body vertices, for with the nearest one alone the posed surface would tear
+    wherever the neighbour changes.
+    """
+    path = folder / "config.yaml"
+    if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is WeightSource.learned:
+        return load_canonicalizer(folder, "cpu").forward_field
+    return BodyField(template)
 
 
 def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
     """The folder of an outfit's canonicalizer, ``<runs>/canonical/<dataset>/<outfit>/<name>``, after a check.
 
-    Raises:
-        DataError: with the command that makes it, when it is not there or was made for another body.
+    Raises `DataError` with the command that makes it, when it is not there or was made for another body.
     """
     folder = runs_root / CANONICALIZERS / outfit.dataset / outfit.name / name
     where = [f"dataset={outfit.dataset}", f"outfit={outfit.name}", f"name={name}"]
@@ -322,8 +314,7 @@ def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
 def canonical_outfits(runs_root: Path, outfits: list[Outfit], name: str) -> list[Outfit]:
     """The outfits in canonical space: scans of their canonicalizers' runs in place of the posed ones.
 
-    Raises:
-        DataError: when a training frame's scan has not been canonicalized.
+    Raises `DataError` when a training frame's scan has not been canonicalized.
     """
     resting = []
     for outfit in outfits:

@@ -13,45 +13,36 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig
-from avatar.checks import AvatarError, check_shape
+from avatar.checks import AvatarError
 from avatar.data.outfits import Outfit
-from avatar.geometry.sparse import pick
-from avatar.geometry.surface import interpolate, vertex_normals
+from avatar.geometry.surface import interpolate
 from avatar.geometry.transforms import transform_directions, transform_points
-from avatar.methods.base import CANONICALIZER, FitOptions, TrainedAvatar
+from avatar.methods.base import CANONICALIZER, TrainedAvatar
 from avatar.methods.canonicalizer import canonicalizer_folder, load_canonicalizer
 from avatar.methods.points import PointMethod
-from avatar.methods.settings import RunConfig
-from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, TemplateNetwork, bare_body
-from avatar.nn.encoders import Encoder, build_encoder
+from avatar.methods.settings import FitConfig, RunConfig
+from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, TemplateNetwork
+from avatar.nn.encoders import ENCODERS, Encoder, PointNet2Config
 from avatar.nn.locality import LocalPoseConfig, LocalPoseEncoder
-from avatar.nn.pointnet2 import PointNet2Config
 from avatar.nn.posing import LearnedSkinning
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 from avatar.settings import settings_from_dict, settings_to_dict
 
 FULL_GARMENT_ENCODER = {
-    "abstraction": (
-        (32, 32, 32),
-        (32, 32, 64),
-        (64, 64, 64),
-        (64, 64, 128),
-        (128, 128, 128),
-        (128, 128, 128),
-    ),
+    "abstraction": ((32, 32, 32), (32, 32, 64), (64, 64, 64), (64, 64, 128), (128, 128, 128), (128, 128, 128)),
     "propagation": ((128, 128), (128, 64), (64, 64), (64, 64), (64, 64), (64, 64)),
 }
 
 
 class Skinning(Enum):
-    """Whose skinning poses the dressed surface from the canonical pose to a frame's."""
+    """Source of the skinning that poses the dressed surface from the canonical pose to a frame's."""
 
     body = "body"  # CloSET: the transform of the skin an offset starts from
-    learned = "learned"  # SCANimate: a canonicalizer's field, asked at the offset point itself
+    learned = "learned"  # SCANimate: a canonicalizer's field, evaluated at the offset point itself
 
 
 class PoseLocality(Enum):
-    """What a point's wrinkles may know of the pose."""
+    """What a point's wrinkles may depend on of the pose."""
 
     whole = "global"  # CloSET: PointNet++ over the posed body, whose coarse levels see all of it
     kinematic = "kinematic"  # SCANimate: the joints near the point in the kinematic tree
@@ -86,31 +77,25 @@ class ClosetConfig:
         if self.train_field and self.skinning is Skinning.body:
             raise AvatarError("train_field: there is a field to train with skinning=learned only.")
         if self.code_channels < 1 or self.code_std < 0 or self.offset_scale <= 0 or self.pose_noise < 0:
-            raise AvatarError(
-                "code_channels, offset_scale: expected positive values, code_std, pose_noise: not negative ones, "
-                f"got {self.code_channels}, {self.offset_scale}, {self.code_std}, {self.pose_noise}."
-            )
+            expected = "code_channels, offset_scale: expected positive values, code_std, pose_noise: not negative ones"
+            got = f"{self.code_channels}, {self.offset_scale}, {self.code_std}, {self.pose_noise}"
+            raise AvatarError(f"{expected}, got {got}.")
 
 
 class ClosetAvatar(TemplateNetwork):
-    """The CloSET network: garment codes and pose encoded on the surface, decoded into a posed oriented point cloud.
+    """The CloSET network: garment codes on the template's vertices and the pose, both encoded on the surface.
 
-    For one outfit or many; each outfit is a learned code on the template's vertices. The garment branch does not
-    see the pose, so it runs once an outfit in the batch, whatever the number of frames.
+    With learned skinning ``x = T(w(c)) c``, c = p + r in the canonical pose.
     """
-
-    outfit_modules = ("garment_encoder", "garment_decoder")  # see `nn.shared_norm.synchronize_norms`
 
     def __init__(self, template: Template, outfits: int, config: ClosetConfig):
         """Builds the network on a body template for a number of outfits."""
-        super().__init__()
-        self.config = config
+        super().__init__(template, config)
         self.skinning: LearnedSkinning | None = None
-        self.register_buffer("vertices", template.vertices.clone(), persistent=False)
-        self.register_buffer("skin_normals", vertex_normals(template.vertices, template.faces), persistent=False)
         codes = torch.randn(outfits, len(template.vertices), config.code_channels) * config.code_std
         self.codes = nn.Parameter(codes)
-        self.garment_encoder = build_encoder(config.encoder, template, config.code_channels, config.garment_encoder)
+        encoder = ENCODERS[config.encoder]
+        self.garment_encoder = encoder(template, config.code_channels, config.garment_encoder)
         channels = self.garment_encoder.out_channels + 3
         if config.template:
             self.garment_decoder = ShapeDecoder(channels, config.garment_decoder)
@@ -118,14 +103,13 @@ class ClosetAvatar(TemplateNetwork):
             if config.pose_locality is PoseLocality.kinematic:
                 self.pose_encoder = LocalPoseEncoder(template, config.local_encoder)
             else:
-                self.pose_encoder = build_encoder(config.encoder, template, 3, config.pose_encoder)
+                self.pose_encoder = encoder(template, 3, config.pose_encoder)
             self.pose_decoder = ShapeDecoder(channels + self.pose_encoder.out_channels, config.pose_decoder)
 
     def skin_with(self, skinning: LearnedSkinning) -> None:
         """Gives a model with ``skinning=learned`` its outfits' fields; they are part of its state from then on.
 
-        Raises:
-            AvatarError: for a model skinned by the body, or fields of another number of outfits.
+        Raises `AvatarError` for a model skinned by the body, or fields of another number of outfits.
         """
         if self.config.skinning is not Skinning.learned:
             raise AvatarError("skinning: this model is skinned by the body (skinning=body) and takes no fields.")
@@ -134,12 +118,12 @@ class ClosetAvatar(TemplateNetwork):
             raise AvatarError(f"fields: expected one for each of {len(self.codes)} outfits, got {count}.")
         self.skinning = skinning
 
-    def surface_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
+    def garment_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
         """Garment features of each sample: ``(O, V, C)`` codes to ``(O, N, C')``."""
         return interpolate(self.garment_encoder(codes), samples)
 
     def pose_features(self, batch: Batch, samples: SurfaceSamples) -> Tensor:
-        """What each sample knows of its frame's pose, ``(B, N, C)``."""
+        """Features ``(B, N, C)`` of each sample, of its frame's whole pose or of the joints near it."""
         if self.config.pose_locality is PoseLocality.kinematic:
             return self.pose_encoder(batch.joint_transforms, samples)
         pose_vertices = batch.pose_vertices
@@ -147,72 +131,20 @@ class ClosetAvatar(TemplateNetwork):
             pose_vertices = pose_vertices + torch.randn_like(pose_vertices) * self.config.pose_noise
         return interpolate(self.pose_encoder(pose_vertices), samples)
 
-    def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
-        """Predicts the dressed surface of each frame at the sampled template points.
+    def pose_points(self, local: Decoded, batch: Batch, samples: SurfaceSamples) -> Prediction:
+        """As `TemplateNetwork.pose_points`, with learned skinning by the fields of the batch's outfits.
 
-        Args:
-            batch: posed bodies with their outfits (its scans are not looked at).
-            samples: N points on the template; any number, the same network serves all.
-            wrinkles: False leaves the pose branch out: the garment template alone, skinned by the body.
-
-        Returns:
-            `Prediction` with ``x = T r + p`` (CloSET 3.2), r = r^g + r^p in the body's local frame; with learned
-            skinning ``x = T(w(c)) c``, c = p + r in the canonical pose.
+        Raises `AvatarError` with learned skinning, before `skin_with` gave the model its fields.
         """
-        check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=len(self.vertices))
-        if not (wrinkles or self.config.template):
-            raise AvatarError("wrinkles: a model without explicit garment template has nothing else to predict.")
-        outfits = batch.outfits
-        row = torch.searchsorted(outfits, batch.outfit_ids)
-        codes = pick(self.codes, outfits)
-        garment, places = self.surface_features(codes, samples), interpolate(self.vertices, samples)
-        parts = []
-        if self.config.template:
-            decoded = self.garment_decoder(garment, places)
-            parts.append(Decoded(pick(decoded.offsets, row), pick(decoded.normals, row)))
-        if self.config.pose and wrinkles:
-            pose = self.pose_features(batch, samples)
-            parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1), places))
-        local = sum(parts, bare_body(self.skin_normals, samples, self.config.normals))
-
-        scale = self.config.offset_scale
-        offsets = (local.offsets * scale).float()
-        apart = self.config.template and self.config.pose and wrinkles  # alone they are the whole, not a part of it
-        posed = self.pose_points(Decoded(offsets, local.normals.float()), batch, samples)
-        return Prediction(
-            points=posed.offsets,
-            normals=posed.normals,
-            offsets=offsets,
-            garment_offsets=parts[0].offsets.float() * scale if self.config.template else None,
-            wrinkle_offsets=parts[-1].offsets.float() * scale if apart else None,
-            wrinkle_normals=parts[-1].normals.float() if apart else None,
-            codes=codes,
-        )
-
-    def pose_points(self, local: Decoded, batch: Batch, samples: SurfaceSamples) -> Decoded:
-        """Offsets from the skin, in metres, and normals posed with the batch's bodies: posed points, unit normals.
-
-        In float32 whatever the network runs in: half precision is millimetres here.
-
-        Raises:
-            AvatarError: with learned skinning, before `skin_with` gave the model its fields.
-        """
+        if self.config.skinning is Skinning.body or batch.canonical:
+            return super().pose_points(local, batch, samples)
+        if self.skinning is None:
+            raise AvatarError("skinning: expected the fields of a canonicalizer (skin_with) before the first use.")
         with torch.autocast(local.offsets.device.type, enabled=False):
-            if self.config.skinning is Skinning.body or batch.canonical:
-                linear = interpolate(batch.vertex_transforms[..., :3, :3].flatten(-2), samples).unflatten(-1, (3, 3))
-                points = interpolate(batch.vertices, samples) + (linear @ local.offsets.unsqueeze(-1)).squeeze(-1)
-                normals = (linear @ local.normals.unsqueeze(-1)).squeeze(-1)
-                return Decoded(points, normalize(normals, dim=-1))
-            if self.skinning is None:
-                raise AvatarError("skinning: expected the fields of a canonicalizer (skin_with) before the first use.")
             canonical = self.skinning.skin(batch.outfit_ids, samples) + local.offsets
             transforms = self.skinning(canonical, batch.joint_transforms, batch.outfit_ids)
-            points = transform_points(transforms, canonical)
-            return Decoded(points, normalize(transform_directions(transforms, local.normals), dim=-1))
-
-    def decode_garment(self, codes: Tensor, samples: SurfaceSamples) -> Decoded:
-        """What the garment decoder gives for codes ``(O, ...)``: offsets and normals ``(O, N, 3)``."""
-        return self.garment_decoder(self.surface_features(codes, samples), interpolate(self.vertices, samples))
+            normals = normalize(transform_directions(transforms, local.normals), dim=-1)
+            return Prediction(transform_points(transforms, canonical), normals, local.offsets)
 
 
 class Closet(PointMethod):
@@ -238,38 +170,28 @@ class Closet(PointMethod):
             return {}
         return {"fields": [settings_to_dict(skin.config) for skin in model.skinning.fields]}
 
-    def rebuild(
-        self, settings: ClosetConfig, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping
-    ) -> ClosetAvatar:
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> ClosetAvatar:
         model = super().rebuild(settings, template, outfits, facts, weights)
         if settings.skinning is Skinning.learned:
-            model.skin_with(rebuild_skinning(facts["fields"], template))
+            box = torch.tensor([[-1.0], [1.0]]).expand(2, 3)  # the fields' sizes alone matter: their state is loaded
+            configs = [settings_from_dict(SkinningFieldConfig, values, "fields.") for values in facts["fields"]]
+            fields = [SkinningField(len(template.parents), config, box) for config in configs]
+            model.skin_with(LearnedSkinning(fields, [template] * len(fields)))
         return model
 
-    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
+    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         """As `PointMethod.fit_code`. Raises `AvatarError` with learned skinning, whose fields are the outfits' own."""
         if avatar.settings.skinning is Skinning.learned:
-            raise AvatarError(
-                "run: learned skinning belongs to the outfits it was trained on. Hint: canonicalize and train the new "
-                "one, or fit a run with skinning=body."
-            )
+            hint = "canonicalize and train the new one, or fit a run with skinning=body."
+            raise AvatarError(f"run: learned skinning belongs to the outfits it was trained on. Hint: {hint}")
         return super().fit_code(avatar, batch, options)
 
 
 def learned_skinning(runs_root: Path, outfits: list[Outfit], name: str, trainable: bool) -> LearnedSkinning:
     """Forward fields of the outfits' canonicalizers, ready to pose an avatar.
 
-    Raises:
-        DataError: when a canonicalizer is not there, or learned no field (weights=nearest, knn).
+    Raises `DataError` when a canonicalizer is not there, or learned no field (weights=nearest, knn).
     """
     folders = [canonicalizer_folder(runs_root, outfit, name) for outfit in outfits]
     fields = [load_canonicalizer(folder, "cpu").forward_field for folder in folders]
     return LearnedSkinning(fields, [outfit.template for outfit in outfits], trainable)
-
-
-def rebuild_skinning(described: list[dict[str, Any]], template: Template) -> LearnedSkinning:
-    """Skinning of the described sizes on a body of the run's topology, its state still to be loaded."""
-    box = torch.tensor([[-1.0], [1.0]]).expand(2, 3)
-    configs = [settings_from_dict(SkinningFieldConfig, values, "fields.") for values in described]
-    fields = [SkinningField(len(template.parents), config, box) for config in configs]
-    return LearnedSkinning(fields, [template] * len(fields))

@@ -8,12 +8,8 @@ from enum import Enum
 from torch import Tensor
 
 from avatar.checks import AvatarError
-from avatar.geometry.distances import (
-    correspond,
-    normal_difference,
-    point_to_plane,
-    point_to_point,
-)
+from avatar.geometry.distances import normal_difference, point_to_plane, point_to_point
+from avatar.geometry.neighbours import correspond
 from avatar.geometry.sparse import gather_rows
 from avatar.records import Batch, LossTerms, Prediction
 
@@ -45,24 +41,15 @@ class LossConfig:
         weights = {key: value for key, value in vars(self).items() if key != "chamfer"}
         wrong = {key: value for key, value in weights.items() if value < 0}
         if wrong or not 0 <= self.normal_start <= 1:
-            raise AvatarError(
-                f"loss: expected weights of at least 0 and normal_start in [0, 1], got {wrong or weights}."
-            )
+            raise AvatarError(f"loss: expected weights of at least 0, normal_start in [0, 1], got {wrong or weights}.")
 
 
 def point_avatar_loss(prediction: Prediction, batch: Batch, config: LossConfig, progress: float) -> LossTerms:
     """CloSET's objective (eqs. 4-6): L = lp Lp + ln Ln + lrgl Lrgl, every part named.
 
-    Args:
-        prediction: what the network gave for the batch.
-        batch: with ``scan_points`` and ``scan_normals (B, M, 3)``.
-        config: weights and switches.
-        progress: share of the training that is done, in [0, 1]; the normal term is switched on by it. Until then it
-            has no gradient at all: Adam makes full steps of any factor, however small.
-
-    Returns:
-        `LossTerms` reduced to means over points and frames: square metres for distances, L1 of unit normals
-        (mean over the three components, as POP's code averages it).
+    Means over points and frames: square metres for distances, L1 of unit normals (mean over the three components, as
+    in POP). ``progress`` is the share of training that is done, in [0, 1]; before ``normal_start`` the normal term has
+    no gradient at all, for Adam makes full steps of any factor, however small.
     """
     found = correspond(prediction.points.detach(), batch.scan_points)
     anchors = gather_rows(batch.scan_points, found.scan_of_point)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
@@ -21,20 +21,10 @@ from avatar.environment import choose_device
 from avatar.geometry.chunks import UNIT, in_chunks
 from avatar.geometry.surface import sample_surface
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.methods.base import (
-    CANONICALIZER,
-    SEED_STRIDE,
-    FitOptions,
-    Inputs,
-    Method,
-    Position,
-    Stage,
-    Task,
-    TrainedAvatar,
-)
+from avatar.methods.base import CANONICALIZER, SEED_STRIDE, Inputs, Method, Position, Stage, Task, TrainedAvatar
 from avatar.methods.canonicalizer import canonical_outfits
 from avatar.methods.losses import TERMS, point_avatar_loss
-from avatar.methods.settings import Precision, RunConfig, Space, TrainConfig
+from avatar.methods.settings import FitConfig, Precision, RunConfig, Space, TrainConfig
 from avatar.progress import tracked
 from avatar.records import Batch, BodyFit, LossTerms, PointCloud, Prediction, Surface, SurfaceSamples, Template
 from avatar.world import current_world, step_outfits
@@ -44,20 +34,15 @@ CHUNK = 100_000  # points decoded at once, or fewer where memory runs out; the n
 
 
 def check_count(points: int) -> None:
-    """Check a number of points a frame.
-
-    Raises:
-        AvatarError: for a count out of 1,000 to 400,000.
-    """
+    """Check a number of points a frame. Raises `AvatarError` for a count out of 1,000 to 400,000."""
     if not 1000 <= points <= MAX_POINTS:
         raise AvatarError(f"points: expected 1,000 to {MAX_POINTS:,}, got {points}.")
 
 
 def draw_samples(model: nn.Module, template: Template, points: int, generator: torch.Generator) -> SurfaceSamples:
-    """Where on the body a network predicts: evenly by area, or at points of its own.
+    """Where on the body a network predicts: evenly by area, or at about as many points of its own.
 
-    A network on UV maps has its grid's pixels or patches instead (``template_samples(points)``); their number is then
-    close to ``points``, not equal.
+    A network on UV maps has the pixels or patches of its grid (``template_samples(points)``).
     """
     own = getattr(model, "template_samples", None)
     samples = own(points) if own else None
@@ -79,15 +64,11 @@ class PointTask(Task):
         frames: int,
         validation: Callable[[], Iterable[Batch]] = tuple,
     ):
-        """Prepares training.
+        """Prepares training of a network that is called as ``model(batch, samples) -> Prediction``.
 
-        Args:
-            model: called as ``model(batch, samples) -> Prediction``, with its garment codes, if any, in ``codes``.
-            template: where template points are drawn.
-            config: points, rates, losses, precision.
-            batch_at: this rank's shard of a step's batch; it follows from the step alone, so that runs resume.
-            frames: training frames there are.
-            validation: the held-back batches, always the same, in every process.
+        Its garment codes, if any, are in ``codes``. ``batch_at`` gives this rank's shard of a step's batch, which
+        follows from the step alone; ``frames`` is the number of training frames; ``validation`` gives the held-back
+        batches of all ranks.
         """
         self.model, self.template, self.config = model, template, config
         self.batch_at, self.validation, self.frames, self.batch = batch_at, validation, frames, config.batch
@@ -99,11 +80,9 @@ class PointTask(Task):
         self.replicated = getattr(model, "outfit_modules", ())
 
     def inputs_at(self, step: int) -> tuple[Batch, SurfaceSamples]:
-        """The batch of a step and its template points."""
         return self.batch_at(step), self.samples_at(step)
 
     def held_back(self) -> Iterator[tuple[Batch, SurfaceSamples]]:
-        """The held-back batches at the fixed template points."""
         return ((batch, self.fixed_points) for batch in self.validation())
 
     def samples_at(self, step: int) -> SurfaceSamples:
@@ -116,7 +95,6 @@ class PointTask(Task):
         return self.draw_points(0).to(self.device)
 
     def draw_points(self, key: int) -> SurfaceSamples:
-        """The template points that a key draws."""
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key)
         return draw_samples(self.model, self.template, self.config.points, generator)
 
@@ -133,16 +111,14 @@ class PointTask(Task):
         # as on devices, where neighbours of NaN are not refused; by the graph of all processes, which wait for it
         defined = replace(prediction, points=prediction.points.nan_to_num(0.0, 0.0, 0.0))
         terms = point_avatar_loss(defined, batch, self.config.loss, position.progress)
-        parts = (terms.raw, terms.weighted)
-        return LossTerms(*({name: value * math.nan for name, value in part.items()} for part in parts))
+        undefined = {name: value * math.nan for name, value in terms.weighted.items()}
+        return LossTerms(dict.fromkeys(terms.raw, torch.tensor(math.nan)), undefined)
 
     def log_values(self, terms: LossTerms) -> dict[str, float]:
-        """The objective, the unweighted Chamfer distance and every raw term."""
         values = super().log_values(terms)
         return values | {"chamfer": values["scan_to_points"] + values["points_to_scan"]}
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:
-        """The objective and the Chamfer distance, square metres."""
         return super().shown(values) | {"chamfer": f"{values['chamfer'] * 1e4:.3f}e-4"}
 
 
@@ -188,14 +164,10 @@ class PointMethod(Method):
         model = self.build(run, settings, template, outfits).to(choose_device(run.device))
         return PointTask(model, template, train, batch_at, len(frames), validation)
 
-    def rebuild(
-        self, settings: Any, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping[str, Tensor]
-    ) -> nn.Module:
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
         return self.network(template, outfits, settings)
 
-    def predictor(
-        self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
-    ) -> Callable[[BodyFit], Surface]:
+    def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
         samples = template_samples(avatar, points)
         return lambda body: Surface(self.predict_at(avatar, outfit, body, samples))
 
@@ -214,19 +186,13 @@ class PointMethod(Method):
         if body is not None:
             return self.predict_at(avatar, outfit, body, samples, wrinkles=False)
         device = next(avatar.model.parameters()).device
-        decoded = avatar.model.garment_template(avatar.outfit_index(outfit), samples.to(device))
-        return join_clouds([Prediction(decoded.offsets, decoded.normals, decoded.offsets)])
+        return join_clouds([avatar.model.garment_template(avatar.outfit_index(outfit), samples.to(device))])
 
-    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitOptions) -> Tensor:
+    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         """The garment code ``(1, ...)`` that explains one scan best, begun at the mean of the trained codes.
 
-        Args:
-            avatar: a trained avatar, whose network is frozen.
-            batch: one frame with its scan.
-            options: the rate is a tenth of itself for the second half of the steps.
-
-        Raises:
-            AvatarError: for a network without codes.
+        The network is frozen; the rate is a tenth of itself for the second half of the steps. Raises `AvatarError` for
+        a network without codes.
         """
         model, device = avatar.model.eval().requires_grad_(False), next(avatar.model.parameters()).device
         if not hasattr(model, "codes"):
@@ -246,33 +212,24 @@ class PointMethod(Method):
         return model.codes.detach()
 
 
-def template_samples(avatar: TrainedAvatar, points: int, seed: int = 0) -> SurfaceSamples:
-    """The template points a prediction is made at: spread evenly by area, fixed by the seed, or the network's own.
+def template_samples(avatar: TrainedAvatar, points: int) -> SurfaceSamples:
+    """The template points a prediction is made at: spread evenly by area, always the same, or the network's own.
 
-    Raises:
-        AvatarError: for a count out of 1,000 to 400,000.
+    Raises `AvatarError` for a count out of 1,000 to 400,000.
     """
     check_count(points)
-    return draw_samples(avatar.model, avatar.template, points, torch.Generator().manual_seed(seed))
+    return draw_samples(avatar.model, avatar.template, points, torch.Generator().manual_seed(0))
 
 
 def body_batch(bodies: list[BodyFit], outfit: int, names: tuple[str, ...]) -> Batch:
     """Bodies without scans as a batch for prediction."""
-
-    def stack(field: str) -> Tensor:
-        return torch.stack([torch.as_tensor(getattr(body, field), dtype=torch.float32) for body in bodies])
-
+    stacked = {
+        name: torch.stack([torch.as_tensor(getattr(body, name), dtype=torch.float32) for body in bodies])
+        for name in ("pose_vertices", "vertices", "vertex_transforms", "joint_transforms")
+    }
     nothing = torch.zeros(len(bodies), 0, 3)
-    return Batch(
-        pose_vertices=stack("pose_vertices"),
-        vertices=stack("vertices"),
-        vertex_transforms=stack("vertex_transforms"),
-        joint_transforms=stack("joint_transforms"),
-        scan_points=nothing,
-        scan_normals=nothing,
-        outfit_ids=torch.full((len(bodies),), outfit),
-        names=names,
-    )
+    ids = torch.full((len(bodies),), outfit)
+    return Batch(**stacked, scan_points=nothing, scan_normals=nothing, outfit_ids=ids, names=names)
 
 
 @torch.no_grad()

@@ -7,23 +7,19 @@ from enum import Enum
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize
 
-from avatar.checks import AvatarError, check_shape
-from avatar.geometry.sparse import pick
-from avatar.geometry.surface import interpolate, vertex_normals
-from avatar.geometry.transforms import transform_directions
+from avatar.checks import AvatarError
 from avatar.methods.points import PointMethod
-from avatar.nn.atlas import Atlas, uv_and_patch
-from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, TemplateNetwork, bare_body
+from avatar.nn.atlas import Atlas
+from avatar.nn.decoders import DecoderConfig, Normals, ShapeDecoder, TemplateNetwork
 from avatar.nn.unet import UNet, UNetConfig
-from avatar.records import Batch, Prediction, SurfaceSamples, Template
+from avatar.records import Batch, SurfaceSamples, Template
 
 PLACE_CHANNELS = 4  # UV coordinates, and patch coordinates that are zero: POP's decoder has kept SCALE's input
 
 
 class PointSource(Enum):
-    """Where on the body points are predicted."""
+    """Places on the body where points are predicted."""
 
     grid = "grid"  # POP: the pixels of a square UV grid, which leaves out small triangles
     surface = "surface"  # CloSET: even by area, as the caller draws them
@@ -47,37 +43,27 @@ class PopConfig:
 
     def __post_init__(self):
         if min(self.map_size, self.code_channels) < 1 or self.smoothing < 0:
-            raise AvatarError(
-                "map_size, code_channels: expected at least 1, smoothing: at least 0, "
-                f"got {self.map_size}, {self.code_channels}, {self.smoothing}."
-            )
-        if self.map_size % 2**self.pose_encoder.levels:
-            raise AvatarError(
-                f"map_size: expected a multiple of {2**self.pose_encoder.levels}, as pose_encoder.levels="
-                f"{self.pose_encoder.levels} halvings need, got {self.map_size}."
-            )
+            got = f"{self.map_size}, {self.code_channels}, {self.smoothing}"
+            raise AvatarError(f"map_size, code_channels: expected at least 1, smoothing: at least 0, got {got}.")
+        self.pose_encoder.check_map_size(self.map_size)
         if self.code_std < 0 or self.offset_scale <= 0:
-            raise AvatarError(
-                f"code_std, offset_scale: expected at least 0 and above 0, got {self.code_std}, {self.offset_scale}."
-            )
+            got = f"{self.code_std}, {self.offset_scale}"
+            raise AvatarError(f"code_std, offset_scale: expected at least 0 and above 0, got {got}.")
 
 
 class PopAvatar(TemplateNetwork):
-    """The POP network, for one outfit or many: each is a learned feature map beside that of the pose.
+    """The POP network: a learned feature map of the garment beside a U-Net's over the posed body's position map.
 
-    The pose map is a U-Net over the posed body's position map. Both maps are looked up at a point's place in the
-    atlas, so features jump where the atlas is cut, however near two points are on the body.
+    Both maps are looked up at a point's place in the atlas, so features jump where the atlas is cut, however near two
+    points are on the body.
     """
 
-    outfit_modules = ("garment_encoder", "garment_decoder")  # see `nn.shared_norm.synchronize_norms`
+    scale_first = True
 
     def __init__(self, template: Template, outfits: int, config: PopConfig):
         """Builds the network on a body template with UV coordinates for a number of outfits."""
-        super().__init__()
-        self.config = config
+        super().__init__(template, config)
         self.atlas = Atlas(template, config.map_size)
-        self.register_buffer("vertices", template.vertices.clone(), persistent=False)
-        self.register_buffer("skin_normals", vertex_normals(template.vertices, template.faces), persistent=False)
         channels, size = config.code_channels, config.map_size
         self.codes = nn.Parameter(torch.randn(outfits, channels, size, size) * config.code_std)
         convolutions = [nn.Conv2d(channels, channels, 5, padding=2, bias=False) for _ in range(config.smoothing)]
@@ -96,56 +82,14 @@ class PopAvatar(TemplateNetwork):
         """Garment features of each point: ``(O, C, S, S)`` codes to ``(O, N, C)``."""
         return self.atlas.look_up_at(samples)(self.garment_encoder(codes))
 
+    def pose_features(self, batch: Batch, samples: SurfaceSamples) -> Tensor:
+        """Features ``(B, N, C)`` of each sample in the map of its frame's pose."""
+        return self.atlas.look_up_at(samples)(self.pose_encoder(self.atlas.position_map(batch.pose_vertices)))
+
     def places(self, samples: SurfaceSamples) -> Tensor:
         """UV and patch coordinates of each point, ``(N, 4)``."""
         uv = self.atlas.place(samples)
-        return uv_and_patch(uv, torch.zeros_like(uv))
-
-    def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
-        """Predicts the dressed surface of each frame at template points.
-
-        Args:
-            batch: posed bodies with their outfits (its scans are not looked at).
-            samples: N points on the template; any on the body, `template_samples` gives the paper's.
-            wrinkles: False leaves the pose out, for a network with an explicit template.
-
-        Returns:
-            `Prediction` with ``x = T r + p``; its parts are named with an explicit template alone.
-        """
-        check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=len(self.vertices))
-        if not (wrinkles or self.config.template):
-            raise AvatarError("wrinkles: a model without explicit garment template has nothing else to predict.")
-        outfits = batch.outfits
-        row = torch.searchsorted(outfits, batch.outfit_ids)
-        codes = pick(self.codes, outfits)
-        garment, places = self.garment_features(codes, samples), self.places(samples)
-        parts = []
-        if self.config.template:
-            decoded = self.garment_decoder(garment, places)
-            parts.append(Decoded(pick(decoded.offsets, row), pick(decoded.normals, row)))
-        if wrinkles:
-            image = self.pose_encoder(self.atlas.position_map(batch.pose_vertices))
-            pose = self.atlas.look_up_at(samples)(image)
-            parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1), places))
-        parts = [Decoded(part.offsets.float() * self.config.offset_scale, part.normals.float()) for part in parts]
-        local = sum(parts, bare_body(self.skin_normals.float(), samples, self.config.normals))
-        with torch.autocast(local.offsets.device.type, enabled=False):  # half precision is millimetres here
-            linear = interpolate(batch.vertex_transforms[..., :3, :3].flatten(-2), samples).unflatten(-1, (3, 3))
-            points = interpolate(batch.vertices, samples) + transform_directions(linear, local.offsets)
-            normals = normalize(transform_directions(linear, local.normals), dim=-1)
-        return Prediction(
-            points=points,
-            normals=normals,
-            offsets=local.offsets,
-            garment_offsets=parts[0].offsets if self.config.template else None,
-            wrinkle_offsets=parts[-1].offsets if wrinkles and self.config.template else None,
-            wrinkle_normals=parts[-1].normals if wrinkles and self.config.template else None,
-            codes=codes,
-        )
-
-    def decode_garment(self, codes: Tensor, samples: SurfaceSamples) -> Decoded:
-        """What the garment decoder gives for codes ``(O, ...)``: offsets and normals ``(O, N, 3)``."""
-        return self.garment_decoder(self.garment_features(codes, samples), self.places(samples))
+        return torch.cat([uv, torch.zeros_like(uv)], dim=-1)
 
 
 class Pop(PointMethod):

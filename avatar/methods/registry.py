@@ -26,11 +26,7 @@ METHODS = {method.name: method for method in defined_methods()}
 
 
 def find_method(name: str) -> Method:
-    """The method of a name.
-
-    Raises:
-        AvatarError: listing the methods there are.
-    """
+    """The method of a name. Raises `AvatarError` listing the methods there are."""
     if name not in METHODS:
         raise unknown_name("method", name, METHODS)
     return METHODS[name]

@@ -8,28 +8,26 @@ from enum import Enum
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.neighbours import nearest
-from avatar.geometry.sampling import farthest_points
 from avatar.geometry.sparse import SparseRows, gather_sum
-from avatar.geometry.surface import interpolate
+from avatar.geometry.surface import farthest_points, interpolate
 from avatar.geometry.transforms import transform_directions
 from avatar.geometry.uv import uv_barycentric
 from avatar.methods.points import PointMethod
-from avatar.nn.atlas import Atlas, uv_and_patch
+from avatar.nn.atlas import Atlas
 from avatar.nn.decoders import DecoderConfig, Normals, ShapeDecoder
-from avatar.nn.pointnet2 import point_mlp
+from avatar.nn.layers import WideLinear, point_mlp
 from avatar.nn.unet import UNet, UNetConfig
-from avatar.nn.wide import WideLinear
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
 PLACE_CHANNELS = 4  # UV coordinates of the patch, and a point's own in the patch
 
 
 class PoseFeature(Enum):
-    """What a patch knows of the pose."""
+    """What a patch sees of the pose."""
 
     local = "local"  # its pixel of the feature map
     whole = "global"  # one vector for the whole body: the variant in CloSET's table 4
@@ -63,11 +61,7 @@ class ScaleConfig:
     def __post_init__(self):
         if self.patches < 1:
             raise AvatarError(f"patches: expected at least 1, got {self.patches}.")
-        if self.map_size < 1 or self.map_size % 2**self.pose_encoder.levels:
-            raise AvatarError(
-                f"map_size: expected a multiple of {2**self.pose_encoder.levels}, as pose_encoder.levels="
-                f"{self.pose_encoder.levels} halvings need, got {self.map_size}."
-            )
+        self.pose_encoder.check_map_size(self.map_size)
 
 
 class PointNet(nn.Module):
@@ -88,18 +82,17 @@ class PointNet(nn.Module):
 
 
 class ScaleAvatar(nn.Module):
-    """The SCALE network of one outfit: patches that ride on triangles of the posed body and take their shape from it.
+    """The SCALE network of one outfit: patches fixed to triangles of the posed body.
 
-    A patch belongs to a pixel of the position map. It has that pixel's feature, a place on the body and the frame of
-    the triangle there, and its points are told apart by patch coordinates alone: the cell of the pixel a point stands
-    for. A point of the body that lies in no patch's pixel is taken to belong to the patch nearest in the atlas.
+    A patch belongs to a pixel of the position map: it has that pixel's feature, its place on the body and the frame of
+    the triangle there. Its points differ by patch coordinates alone, the cell of the pixel that a point stands for. A
+    point of the body that lies in no patch's pixel belongs to the patch nearest in the atlas.
     """
 
     def __init__(self, template: Template, outfits: int, config: ScaleConfig):
         """Builds the network on a body template with UV coordinates.
 
-        Raises:
-            AvatarError: for more than one outfit, which SCALE has no code for.
+        Raises `AvatarError` for more than one outfit, which SCALE has no code for.
         """
         super().__init__()
         if outfits != 1:
@@ -112,7 +105,7 @@ class ScaleAvatar(nn.Module):
         corners = torch.stack([grid.pixels[chosen] % config.map_size, grid.pixels[chosen] // config.map_size], dim=-1)
         rows, columns = torch.meshgrid(*[torch.arange(config.map_size)] * 2, indexing="ij")
         pixels = torch.stack([columns, rows, torch.zeros_like(rows)], dim=-1).flatten(0, 1).float()
-        owner = nearest(pixels[None], torch.nn.functional.pad(corners, (0, 1))[None].float().cpu())[0]
+        owner = nearest(pixels[None], pad(corners, (0, 1))[None].float().cpu())[0]
         for name, value in {
             "patch_pixels": grid.pixels[chosen],
             "patch_corners": corners,
@@ -131,7 +124,7 @@ class ScaleAvatar(nn.Module):
 
     @property
     def patches(self) -> SurfaceSamples:
-        """Where the patches ride on the body."""
+        """The patches' places on the body."""
         return SurfaceSamples(self.patch_vertex_ids, self.patch_barycentric, self.patch_face_ids)
 
     def template_samples(self, points: int) -> SurfaceSamples:
@@ -149,7 +142,7 @@ class ScaleAvatar(nn.Module):
         return SurfaceSamples(vertex_ids, barycentric.to(self.patch_barycentric.dtype), face_ids)
 
     def pose_features(self, pose_vertices: Tensor) -> Tensor:
-        """What each patch knows of the pose: ``(B, V, 3)`` posed body to ``(B, P, C)``."""
+        """Pose features of the patches: ``(B, V, 3)`` posed body to ``(B, P, C)``."""
         if self.config.pose_feature is PoseFeature.local:
             features = self.pose_encoder(self.atlas.position_map(pose_vertices)).flatten(2).transpose(1, 2)
             return gather_sum(features, SparseRows.of_table(self.patch_pixels[:, None], features.shape[1]))
@@ -168,15 +161,10 @@ class ScaleAvatar(nn.Module):
         return torch.cat([edges, (normals * length).unsqueeze(-1)], dim=-1)
 
     def forward(self, batch: Batch, samples: SurfaceSamples) -> Prediction:
-        """Predicts the dressed surface of each frame at template points.
+        """Predicts the dressed surface of each frame at N points: those of `template_samples` or any on the body.
 
-        Args:
-            batch: posed bodies (its scans are not looked at).
-            samples: N points, those of `template_samples` or any others on the body.
-
-        Returns:
-            `Prediction` with ``x = T r + p``, p a patch's place on the posed body and T its triangle's frame.
-            ``offsets`` are ``T r``: r counts in edges of a triangle, which the regulariser could not compare.
+        ``x = T r + p``, p a patch's place on the posed body and T its triangle's frame. The ``offsets`` of the result
+        are ``T r``: r counts in edges of a triangle, which the regulariser could not compare.
         """
         check_shape("pose_vertices", batch.pose_vertices, "B V 3", V=self.vertex_count)
         size = self.config.map_size
@@ -184,7 +172,7 @@ class ScaleAvatar(nn.Module):
         pixels = spots.floor().long().clamp(0, size - 1)
         patch = self.patch_of_pixel[pixels[:, 1] * size + pixels[:, 0]]
         corners = self.patch_corners[patch]
-        places = uv_and_patch((corners + 0.5) / size, spots - corners)
+        places = torch.cat([(corners + 0.5) / size, spots - corners], dim=-1)
         features = self.pose_features(batch.pose_vertices)
         features = gather_sum(features, SparseRows.of_table(patch[:, None], features.shape[1]))
         local = self.decoder(features, places)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
 from avatar.checks import AvatarError, DataError
@@ -24,15 +23,8 @@ from avatar.implicit.body_field import BodyField
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
 from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
-from avatar.io.documents import read_yaml
 from avatar.methods.base import CANONICALIZER, SEED_STRIDE, Inputs, Method, Position, Stage, Task, TrainedAvatar
-from avatar.methods.canonicalizer import (
-    CanonicalizeConfig,
-    WeightSource,
-    canonical_outfits,
-    canonicalizer_folder,
-    load_canonicalizer,
-)
+from avatar.methods.canonicalizer import canonical_outfits, canonicalizer_folder, find_field
 from avatar.methods.points import check_count
 from avatar.methods.settings import Precision, RunConfig, TrainConfig
 from avatar.records import BodyFit, LossTerms, Surface, Template
@@ -40,7 +32,7 @@ from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.world import require_single_process
 
 FIELD = "field."  # prefix of the forward field's weights among the avatar's
-BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that the box's sides are empty
+BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that no surface meets the box's sides
 
 
 @dataclass
@@ -54,10 +46,8 @@ class ImplicitTrainConfig:
 
     def __post_init__(self):
         if not 0 < self.decay <= 1 or any(not 0 < share < 1 for share in self.decay_at):
-            raise AvatarError(
-                f"decay: expected above 0 and at most 1, decay_at: shares between 0 and 1, "
-                f"got {self.decay} and {self.decay_at}."
-            )
+            expected = "decay: expected above 0 and at most 1, decay_at: shares between 0 and 1"
+            raise AvatarError(f"{expected}, got {self.decay} and {self.decay_at}.")
 
     def rate_factor(self, progress: float) -> float:
         """The learning rate's factor from the decays that are past at a share of training."""
@@ -91,15 +81,7 @@ class ImplicitTask(Task):
         frames: CanonicalFrames,
         checks: CanonicalFrames | None = None,
     ):
-        """Prepares training.
-
-        Args:
-            model: the avatar.
-            body: ``(V, 3)`` canonical body vertices, about which the field is sampled as well.
-            config: budget and optimiser.
-            settings: points in space, weights of the terms, decay of the learning rate.
-            frames: training frames; checks: held-back ones.
-        """
+        """Prepares training on ``frames``, with ``checks`` held back; ``body (V, 3)`` are canonical body vertices."""
         self.model, self.body, self.box = model, body, model.box.cpu()
         self.config, self.settings, self.data, self.checks = config, settings, frames, checks
         self.frames, self.batch = len(frames), config.batch
@@ -111,12 +93,10 @@ class ImplicitTask(Task):
         return self.config.rate_factor(step, progress) * self.settings.rate_factor(progress)
 
     def inputs_at(self, step: int) -> tuple[CanonicalBatch, SpacePoints]:
-        """The batch of a step and its points in space."""
         batch = self.data.batch_at(step, self.config.batch)
         return batch, self.space_at(batch, step)
 
     def held_back(self) -> Iterator[tuple[CanonicalBatch, SpacePoints]]:
-        """The held-back frames, always at the same points."""
         for batch in self.checks.ordered() if self.checks else ():
             yield batch, self.space_at(batch, -1)
 
@@ -126,13 +106,11 @@ class ImplicitTask(Task):
         return space_points(batch.points, self.body, self.box, self.settings.probes, generator)
 
     def loss(self, inputs: Inputs, position: Position) -> LossTerms:
-        """The field at a batch's points and at points in space, and its losses."""
         batch, space = inputs
         values = probe_field(self.model, batch.points, space, batch.joint_transforms)
         return implicit_loss(values, batch.normals, self.settings.loss, batch.colors)
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:
-        """The objective and the mean distance on the scan, millimetres."""
         return super().shown(values) | {"surface": f"{values['surface'] * 1e3:.1f}mm"}
 
 
@@ -174,18 +152,21 @@ class Scanimate(Method):
         return ImplicitAvatar(template, BodyField(template), box, settings.avatar)
 
     def describe(self, model: ImplicitAvatar) -> dict[str, Any]:
-        return {"box": model.box.tolist(), "field": describe_field(model.field)}
+        learned = not isinstance(model.field, BodyField)
+        field = {"learned": settings_to_dict(model.field.config)} if learned else {"neighbours": model.field.neighbours}
+        return {"box": model.box.tolist(), "field": field}
 
-    def rebuild(
-        self, settings: ScanimateConfig, template: Template, outfits: int, facts: Mapping[str, Any], weights: Mapping
-    ) -> ImplicitAvatar:
-        skinning = build_field(facts["field"], template, weights)
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> ImplicitAvatar:
+        if "neighbours" in facts["field"]:
+            skinning = BodyField(template, facts["field"]["neighbours"])
+        else:
+            field_settings = settings_from_dict(SkinningFieldConfig, facts["field"]["learned"])
+            skinning = SkinningField(len(template.parents), field_settings, template.vertices[:2])
+            own = {name.removeprefix(FIELD): value for name, value in weights.items() if name.startswith(FIELD)}
+            skinning.load_state_dict(own)
         return ImplicitAvatar(template, skinning, torch.tensor(facts["box"]), settings.avatar)
 
-    def predictor(
-        self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig
-    ) -> Callable[[BodyFit], Surface]:
-        """As `Method.predictor`: points spread over the posed surface, and that. Raises without a surface."""
+    def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
         check_count(points)
         avatar.outfit_index(outfit)
 
@@ -201,10 +182,9 @@ class Scanimate(Method):
 
 
 def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequence[CanonicalFrame]:
-    """The canonical scans of training frames, with the poses they were taken in; read when they are needed.
+    """The canonical scans of training frames with their poses, read when they are needed.
 
-    Raises:
-        DataError: for a scan that is not there, or without colours where they are to be learned.
+    Raises `DataError` for a scan that is not there, or without colours where they are to be learned.
     """
 
     def read(index: int) -> CanonicalFrame:
@@ -215,35 +195,3 @@ def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequen
         return frame
 
     return LruSequence(read, len(names))
-
-
-def find_field(folder: Path, template: Template) -> nn.Module:
-    """The forward skinning field of a canonicalizer's run: the learned one, or the body's for its baselines.
-
-    Baselines (nearest, knn) learn no field. Both are posed by the six nearest body vertices, for with the nearest one
-    alone the posed surface would tear wherever the neighbour changes.
-    """
-    path = folder / "config.yaml"
-    if not path.is_file():
-        raise DataError(path, "no such file.", "Run tools/canonicalize.py to its end.")
-    if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is WeightSource.learned:
-        return load_canonicalizer(folder, "cpu").forward_field
-    return BodyField(template)
-
-
-def describe_field(forward_field: nn.Module) -> dict[str, Any]:
-    """What `build_field` needs, beside the weights, to make a forward field again."""
-    if isinstance(forward_field, BodyField):
-        return {"neighbours": forward_field.neighbours}
-    return {"learned": settings_to_dict(forward_field.config)}
-
-
-def build_field(facts: dict[str, Any], template: Template, weights: dict[str, Tensor]) -> nn.Module:
-    """The forward field of a run's own facts and weights; the canonicalizer's folder is not looked at."""
-    if "neighbours" in facts:
-        return BodyField(template, facts["neighbours"])
-    settings = settings_from_dict(SkinningFieldConfig, facts["learned"])
-    forward_field = SkinningField(len(template.parents), settings, template.vertices[:2])
-    own = {name.removeprefix(FIELD): value for name, value in weights.items() if name.startswith(FIELD)}
-    forward_field.load_state_dict(own)
-    return forward_field

@@ -127,3 +127,29 @@ class RunConfig:
     def outfits(self) -> list[Outfit]:
         """The run's outfits on disk."""
         return [find_outfit(self.data_root, self.dataset, name, self.scan) for name in self.outfit]
+
+
+@dataclass
+class FitConfig:
+    """Fitting an outfit that a network has not seen, from its first training scan or any other one frame."""
+
+    run: Path = Path("runs/closet/open/several/default")
+    dataset: str = "open"
+    outfit: str = "skirt"
+    frame: str | None = None  # the scan to fit; the first training frame if null
+    data_root: Path = Path("data")
+    runs_root: Path = Path("runs")
+    name: str = "fitted"
+    steps: int = 401  # POP
+    code_lr: float = 5e-4  # POP; divided by ten for the second half
+    points: int = 50000  # template points predicted
+    scan_points: int = 40000
+    seed: int = 0
+    loss: LossConfig = field(default_factory=lambda: LossConfig(normal_start=0.0))
+    device: str = "auto"
+
+    def __post_init__(self):
+        for what in ("name", "dataset", "outfit"):
+            check_name(what, getattr(self, what))
+        if self.steps < 1 or self.code_lr <= 0:
+            raise AvatarError(f"steps, code_lr: expected positive values, got {self.steps} and {self.code_lr}.")

@@ -18,11 +18,7 @@ class Atlas(nn.Module):
     """A body's UV atlas with a position map of a fixed size."""
 
     def __init__(self, template: Template, map_size: int):
-        """Rasterises a template's atlas once.
-
-        Raises:
-            AvatarError: for a template without UV coordinates.
-        """
+        """Rasterises a template's atlas once. Raises `AvatarError` for a template without UV coordinates."""
         super().__init__()
         if template.uv is None or template.uv_faces is None:
             raise AvatarError(
@@ -68,8 +64,7 @@ class Atlas(nn.Module):
     def pixel_points(self, points: int) -> SurfaceSamples:
         """The surface under the pixels of the square grid that has nearest to ``points`` of them in the atlas.
 
-        On SMPL's atlas 50,701 asks for the 256 x 256 grid of POP; on the open body, whose atlas fills 63% of the
-        square, 50,000 gives 282 x 282.
+        On SMPL's atlas 50,701 give POP's 256 x 256 grid; on the open body's 50,000 give 282 x 282.
         """
         if self._asked is None or self._asked[0] != points:
             size = max(1, round(math.sqrt(points / float(uv_areas(self.uv, self.uv_faces).sum()))))
@@ -78,10 +73,10 @@ class Atlas(nn.Module):
 
 
 class LookUp:
-    """Bilinear interpolation of feature images at UV coordinates, in their precision: in half it would be pixels off.
+    """Bilinear interpolation of feature images at UV coordinates, in the coordinates' precision.
 
-    Beyond the outermost centres of pixels an image goes on as it ends. A weighted sum of four pixels a point, which is
-    faster than ``grid_sample`` and repeatable: the backward pass of that adds in an order of chance on CUDA.
+    Beyond the outermost centres of pixels an image is constant. A weighted sum of four pixels a point, faster than
+    ``grid_sample`` and repeatable: the backward pass of that adds in a random order on CUDA.
     """
 
     def __init__(self, uv: Tensor, size: int):
@@ -93,20 +88,15 @@ class LookUp:
         across, down = torch.stack([1 - (places - low), places - low], dim=-1).unbind(dim=1)
         ids = (rows[:, :, None] * size + columns[:, None]).flatten(1)
         self.size = size
-        self.bags = SparseRows.of_table(ids, size**2, (down[:, :, None] * across[:, None]).flatten(1))
+        self.sparse = SparseRows.of_table(ids, size**2, (down[:, :, None] * across[:, None]).flatten(1))
 
     @cached_property
     def back(self) -> SparseRows:
         """The transposed sums, which the backward pass takes."""
-        return self.bags.transpose()
+        return self.sparse.transpose()
 
     def __call__(self, features: Tensor) -> Tensor:
         """Features ``(B, N, C)`` of images ``(B, C, S, S)``."""
         check_shape("features", features, f"B C {self.size} {self.size}")
-        rows = features.to(self.bags.weights.dtype).flatten(2).transpose(1, 2)
-        return gather_sum(rows, self.bags, self.back if rows.requires_grad else None)
-
-
-def uv_and_patch(uv: Tensor, patch: Tensor) -> Tensor:
-    """What POP's and SCALE's decoders know of a point's place: UV and patch coordinates ``(N, 4)``."""
-    return torch.cat([uv, patch], dim=-1)
+        rows = features.to(self.sparse.weights.dtype).flatten(2).transpose(1, 2)
+        return gather_sum(rows, self.sparse, self.back if rows.requires_grad else None)

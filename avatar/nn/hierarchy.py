@@ -1,15 +1,16 @@
-"""Everything in PointNet++ that depends on the template alone, computed once."""
+"""The point hierarchy of PointNet++ and its sparse gathers: all that depends on the template alone, computed once."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.neighbours import ball_query, k_nearest
-from avatar.geometry.sampling import farthest_points
 from avatar.geometry.sparse import SparseRows, gather_sum
+from avatar.geometry.surface import farthest_points
 
 
 @dataclass
@@ -23,44 +24,33 @@ class HierarchyConfig:
     def __post_init__(self):
         self.points, self.radii = tuple(self.points), tuple(self.radii)
         if len(self.points) != len(self.radii) or not self.points:
-            raise AvatarError(
-                f"points, radii: expected one radius a level, got {len(self.points)} and {len(self.radii)}."
-            )
-        if any(a <= b for a, b in zip(self.points, self.points[1:])) or min(self.radii) <= 0:
-            raise AvatarError(
-                f"points, radii: expected falling sizes and positive radii, got {self.points}, {self.radii}."
-            )
+            got = f"{len(self.points)} and {len(self.radii)}"
+            raise AvatarError(f"points, radii: expected one radius a level, got {got}.")
+        if any(a <= b for a, b in itertools.pairwise(self.points)) or min(self.radii) <= 0:
+            got = f"{self.points}, {self.radii}"
+            raise AvatarError(f"points, radii: expected falling sizes and positive radii, got {got}.")
 
 
 class FixedRows(nn.Module):
-    """Sums of bags that stay the same for good, with their transpose made once: ``(..., V, C)`` to ``(..., R, C)``."""
+    """Weighted sums of rows that stay the same, with their transpose made once: ``(..., V, C)`` to ``(..., R, C)``."""
 
-    def __init__(self, bags: SparseRows):
+    def __init__(self, sparse: SparseRows, shape: tuple[int, ...] = (-1,)):
+        """Keeps the sums; ``shape`` is that of the R results."""
         super().__init__()
-        self.rows, back = bags.rows, bags.transpose()
-        self.register_buffer("ids", bags.ids, persistent=False)
-        self.register_buffer("starts", bags.starts, persistent=False)
-        self.register_buffer("weights", bags.weights, persistent=False)
-        self.register_buffer("back_ids", back.ids, persistent=False)
-        self.register_buffer("back_starts", back.starts, persistent=False)
-        self.register_buffer("back_weights", back.weights, persistent=False)
+        self.rows, self.shape, back = sparse.rows, shape, sparse.transpose()
+        for name in ("ids", "starts", "weights"):
+            self.register_buffer(name, getattr(sparse, name), persistent=False)
+            self.register_buffer(f"back_{name}", getattr(back, name), persistent=False)
+
+    @classmethod
+    def of_groups(cls, groups: Tensor, rows: int) -> FixedRows:
+        """Gathers constant groups ``(S, K)`` of rows: ``(B, N, C)`` to ``(B, S, K, C)``."""
+        return cls(SparseRows.of_table(groups.reshape(-1, 1), rows), groups.shape)
 
     def forward(self, values: Tensor) -> Tensor:
-        bags = SparseRows(self.ids, self.starts, self.weights, self.rows)
+        sparse = SparseRows(self.ids, self.starts, self.weights, self.rows)
         back = SparseRows(self.back_ids, self.back_starts, self.back_weights, len(self.starts))
-        return gather_sum(values, bags, back)
-
-
-class Grouping(nn.Module):
-    """Picks constant groups of rows, ``(B, N, C)`` to ``(B, S, K, C)`` for ids ``(S, K)``."""
-
-    def __init__(self, groups: Tensor, rows: int):
-        super().__init__()
-        self.shape = groups.shape
-        self.pick = FixedRows(SparseRows.of_table(groups.reshape(-1, 1), rows))
-
-    def forward(self, values: Tensor) -> Tensor:
-        return self.pick(values).unflatten(1, self.shape)
+        return gather_sum(values, sparse, back).unflatten(-2, self.shape)
 
 
 class Level(nn.Module):
@@ -68,11 +58,12 @@ class Level(nn.Module):
 
     Buffers: ``positions (S, 3)`` of this level's points, ``finer_positions (N, 3)``, ``groups (S, K)`` ball-query
     neighbours in the finer level, ``up_ids (N, 3)`` and ``up_weights (N, 3)`` inverse-squared-distance weights of
-    the three nearest coarse points (PointNet++ eq. 2). ``group`` and ``interpolate_up`` are what is done with them.
+    the three nearest coarse points (PointNet++ eq. 2).
     """
 
     def __init__(self, finer: Tensor, count: int, radius: float, neighbours: int):
         super().__init__()
+        self.radius = radius
         coarse = finer[farthest_points(finer, count)]
         up_ids = k_nearest(finer[None], coarse[None], min(3, count))[0]
         inverse = 1 / ((finer[:, None] - coarse[up_ids]).square().sum(dim=-1) + 1e-8)
@@ -84,21 +75,19 @@ class Level(nn.Module):
             "up_weights": inverse / inverse.sum(dim=1, keepdim=True),
         }.items():
             self.register_buffer(name, value.clone(), persistent=False)
-        self.group = Grouping(self.groups, len(finer))
+        self.group = FixedRows.of_groups(self.groups, len(finer))
         self.interpolate_up = FixedRows(SparseRows.of_table(self.up_ids, count, self.up_weights))
 
 
 def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:
     """The levels of a hierarchy over constant points ``(V, 3)``, finest first; nested farthest-point subsets.
 
-    Raises:
-        AvatarError: when the template has no more points than the finest level.
+    Raises `AvatarError` when the template has no more points than the finest level.
     """
-    dims = check_shape("positions", positions, "V 3")
-    if dims["V"] <= config.points[0]:
-        raise AvatarError(
-            f"points: expected a finest level below the template's {dims['V']} vertices, got {config.points[0]}."
-        )
+    count = check_shape("positions", positions, "V 3")["V"]
+    if count <= config.points[0]:
+        expected = f"a finest level below the template's {count} vertices"
+        raise AvatarError(f"points: expected {expected}, got {config.points[0]}.")
     levels, finer = nn.ModuleList(), positions.detach()
     for count, radius in zip(config.points, config.radii):
         levels.append(Level(finer, count, radius, config.neighbours))

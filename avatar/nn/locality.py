@@ -1,8 +1,4 @@
-"""Local pose conditioning (SCANimate 3.2): a point of the surface sees only the joints near it in the kinematic tree.
-
-A hierarchy over the surface passes every joint's motion to every point in its coarse levels. Here the pose features
-are a function of the point alone: where it is, and the joints it may see.
-"""
+"""Local pose conditioning (SCANimate 3.2): features of a place and of the joints near it in the kinematic tree."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from avatar.checks import AvatarError
 from avatar.geometry.precision import full_precision
 from avatar.geometry.surface import interpolate
 from avatar.geometry.transforms import relative_quaternions
-from avatar.nn.pointnet2 import PointNorm, point_mlp
+from avatar.nn.layers import PointNorm, point_mlp
 from avatar.records import SurfaceSamples, Template
 
 
@@ -31,10 +27,8 @@ class LocalPoseConfig:
     def __post_init__(self):
         self.widths = tuple(self.widths)
         if self.rings < 0 or self.orders < 0 or not self.widths or min(self.widths) < 1:
-            raise AvatarError(
-                "rings, orders: expected at least 0, widths: one or more positive numbers of channels, "
-                f"got {self.rings}, {self.orders} and {self.widths}."
-            )
+            expected = "rings, orders: expected at least 0, widths: one or more positive numbers of channels"
+            raise AvatarError(f"{expected}, got {self.rings}, {self.orders} and {self.widths}.")
 
 
 def pose_gates(template: Template, rings: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Posing by learned skinning: canonical points are carried by a field's weights where they are, not by the body's."""
+"""Posing by learned skinning: canonical points are skinned with a field's weights at their place, not the body's."""
 
 from __future__ import annotations
 
@@ -18,22 +18,15 @@ class LearnedSkinning(nn.Module):
     """Forward skinning with one field an outfit (SCANimate 3.1), on the subject's own body.
 
     A skirt's points hang far from the skin they belong to on the template; with the body's weights they follow that
-    skin and tear between the legs. A field is asked at the offset point itself.
-
-    A run's template is the mean of its outfits' bodies, while a field and the joint transforms of a frame belong to
-    one subject; so each outfit's own canonical body stands here, in the state that is saved with the weights.
+    skin and tear between the legs. A field is evaluated at the offset point itself. A run's template is the mean of its
+    outfits' bodies, so each subject's own canonical body is kept here, in the state that is saved with the weights.
     """
 
     def __init__(self, fields: Sequence[nn.Module], subjects: Sequence[Template], trainable: bool = False):
-        """Takes an outfit's field and body from the same place of two lists.
+        """Takes one field and one body at rest an outfit, of one topology; ``trainable`` fields are trained too.
 
-        Args:
-            fields: called as ``field(points (B, N, 3)) -> weights (B, N, J)`` on canonical points.
-            subjects: bodies at rest, of one topology.
-            trainable: whether training moves the fields too.
-
-        Raises:
-            AvatarError: when there is not one field an outfit.
+        A field is called as ``field(points (B, N, 3)) -> weights (B, N, J)`` on canonical points. Raises `AvatarError`
+        when there is not one an outfit.
         """
         super().__init__()
         if not subjects or len(fields) != len(subjects):
@@ -49,15 +42,9 @@ class LearnedSkinning(nn.Module):
         return interpolate(self.vertices[outfit_ids], samples)
 
     def forward(self, points: Tensor, joint_transforms: Tensor, outfit_ids: Tensor) -> Tensor:
-        """Posed_from_canonical transform of each point; differentiable in the points, through the weights too.
+        """posed_from_canonical ``(B, N, 4, 4)`` of points ``(B, N, 3)``; differentiable in the points.
 
-        Args:
-            points: ``(B, N, 3)`` canonical, metres.
-            joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical of each frame, place and heading included.
-            outfit_ids: ``(B,)`` which field and body each frame has.
-
-        Returns:
-            ``(B, N, 4, 4)``.
+        ``joint_transforms (B, J, 4, 4)`` are each frame's, ``outfit_ids (B,)`` choose its field and body.
         """
         frames = {outfit: (outfit_ids == outfit).nonzero()[:, 0] for outfit in outfit_ids.unique().tolist()}
         weights = torch.cat([self.fields[outfit](pick(points, rows)) for outfit, rows in frames.items()])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
-from avatar.nn.wide import WideConv2d
+from avatar.nn.layers import WideConv2d
 
 SMOOTH_LEVELS = 3  # the last ones upsample and convolve, for transposed convolutions leave checkerboards
 WIDEST = 8  # times the first level's channels
@@ -26,9 +26,15 @@ class UNetConfig:
 
     def __post_init__(self):
         if self.levels < SMOOTH_LEVELS or self.width < 1 or self.out_channels < 1:
-            raise AvatarError(
-                f"levels, width, out_channels: expected at least {SMOOTH_LEVELS}, 1 and 1, got {vars(self)}."
-            )
+            expected = f"expected at least {SMOOTH_LEVELS}, 1 and 1"
+            raise AvatarError(f"levels, width, out_channels: {expected}, got {vars(self)}.")
+
+    def check_map_size(self, size: int) -> None:
+        """Refuses images whose ``size`` pixels a side cannot be halved at every level, with an `AvatarError`."""
+        parts = 2**self.levels
+        if size < 1 or size % parts:
+            needed = f"expected a multiple of {parts}, as pose_encoder.levels={self.levels} halvings need"
+            raise AvatarError(f"map_size: {needed}, got {size}.")
 
 
 class Doubling(nn.Module):
@@ -39,15 +45,15 @@ class Doubling(nn.Module):
     """
 
     def forward(self, image: Tensor) -> Tensor:
-        rows, columns = (doubling_matrix(size, image) for size in image.shape[-2:])
+        rows, columns = (self.weights(size, image) for size in image.shape[-2:])
         return rows @ image @ columns.T
 
-
-def doubling_matrix(size: int, like: Tensor) -> Tensor:
-    """Weights ``(2 size, size)`` of linear interpolation between centres of pixels, constant beyond the outermost."""
-    centres = torch.arange(size, device=like.device)
-    places = (torch.arange(2 * size, device=like.device) / 2 - 0.25).clamp(0, size - 1)
-    return (1 - (places[:, None] - centres).abs()).clamp(min=0).to(like.dtype)
+    @staticmethod
+    def weights(size: int, like: Tensor) -> Tensor:
+        """Weights ``(2 size, size)`` between the centres of pixels, constant beyond the outermost."""
+        centres = torch.arange(size, device=like.device)
+        places = (torch.arange(2 * size, device=like.device) / 2 - 0.25).clamp(0, size - 1)
+        return (1 - (places[:, None] - centres).abs()).clamp(min=0).to(like.dtype)
 
 
 class UNet(nn.Module):
@@ -70,27 +76,19 @@ class UNet(nn.Module):
         for level, fan_out in enumerate([*reversed(widths), config.out_channels]):
             last = level == config.levels - 1
             norm = [] if last else [nn.BatchNorm2d(fan_out, affine=config.affine)]
-            self.ups.append(nn.Sequential(nn.ReLU(), *self._enlarge(level, fan_in, fan_out), *norm))
+            if level < config.levels - SMOOTH_LEVELS:
+                enlarge = [nn.ConvTranspose2d(fan_in, fan_out, 4, stride=2, padding=1, bias=False)]
+            else:
+                enlarge = [Doubling(), nn.Conv2d(fan_in, fan_out, 3, padding=1)]
+            self.ups.append(nn.Sequential(nn.ReLU(), *enlarge, *norm))
             fan_in = 2 * fan_out
 
-    def _enlarge(self, level: int, fan_in: int, fan_out: int) -> list[nn.Module]:
-        """Layers that double the size of an image."""
-        if level < self.config.levels - SMOOTH_LEVELS:
-            return [nn.ConvTranspose2d(fan_in, fan_out, 4, stride=2, padding=1, bias=False)]
-        return [Doubling(), nn.Conv2d(fan_in, fan_out, 3, padding=1)]
-
     def forward(self, image: Tensor) -> Tensor:
-        """``(B, C, H, W)`` to ``(B, C', H, W)``; height and width are multiples of ``2 ** levels``.
-
-        Raises:
-            AvatarError: for an image of another size.
-        """
-        dims = check_shape("image", image, "B C H W", C=self.channels)
-        if dims["H"] % 2**self.config.levels or dims["W"] % 2**self.config.levels:
-            raise AvatarError(
-                f"image: expected height and width in multiples of {2**self.config.levels}, as {self.config.levels} "
-                f"levels need, got {dims['H']} x {dims['W']}."
-            )
+        """``(B, C, H, W)`` to ``(B, C', H, W)``; raises `AvatarError` unless both are multiples of ``2 ** levels``."""
+        dims, parts = check_shape("image", image, "B C H W", C=self.channels), 2**self.config.levels
+        if dims["H"] % parts or dims["W"] % parts:
+            needed = f"height and width in multiples of {parts}, as {self.config.levels} levels need"
+            raise AvatarError(f"image: expected {needed}, got {dims['H']} x {dims['W']}.")
         pyramid = []
         for down in self.downs:
             image = down(image)

@@ -20,7 +20,7 @@ from avatar.evaluation.canonical_truth import Canonicalized, check_truth
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.evaluation.scoring import Label
 from avatar.evaluation.tables import to_markdown
-from avatar.export.drawing import Camera, frame_camera, load_pyvista
+from avatar.export.drawing import frame_camera, load_pyvista
 from avatar.export.pictures import contact_sheet, render_mesh, render_points, save_picture
 from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, module_digest
@@ -63,10 +63,9 @@ def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
     Raises:
         AvatarError: for data that were not simulated.
     """
-    if not config.scored:
-        return
     try:
-        check_truth(frames.frame(0).scan)
+        if config.scored:
+            check_truth(frames.frame(0).scan)
     except AvatarError as error:
         raise AvatarError(f"scored, {config.dataset}/{config.outfit}: {error} Hint: leave out scored.") from error
 
@@ -92,7 +91,7 @@ def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> S
                 source = skinning_source(settings, outfit.template)
                 learned = (source.steps, source.seconds) if isinstance(source, TrainedCanonicalizer) else (0, 0.0)
                 label = Label(kind.value, "canonical", split, 0, *learned, current_commit())
-                methods[label] = carrier(config, source)
+                methods[label] = canonicalizer_with(config, source)
                 made_by[label] = digest_of([scans_digest(settings), module_digest(__name__)])
             found = score_canonicalization(outfit, split, names, methods, ledger, made_by)
             plain = [replace(row, variant="") for row in found.rows]
@@ -105,13 +104,12 @@ def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> S
     return scores
 
 
-def carrier(config: CanonicalizeConfig, source: SkinningSource) -> Callable[[Frame], Canonicalized]:
+def canonicalizer_with(config: CanonicalizeConfig, source: SkinningSource) -> Callable[[Frame], Canonicalized]:
     """What a source of weights makes of a frame, with the weights that it gives to canonical points."""
-    learned = isinstance(source, TrainedCanonicalizer)
     template = source.template
-    field = source.forward_field if learned else None
+    field = source.forward_field if isinstance(source, TrainedCanonicalizer) else None
 
-    def carry(frame: Frame) -> Canonicalized:
+    def unpose(frame: Frame) -> Canonicalized:
         weights = source.weights_of(frame.scan.points, frame)
         scan = canonicalize_scan(frame.scan, frame.body, weights, template, config.stretch)
         if field is not None:
@@ -120,7 +118,7 @@ def carrier(config: CanonicalizeConfig, source: SkinningSource) -> Callable[[Fra
                 return Canonicalized(scan, field(points)[0].cpu().numpy())
         return Canonicalized(scan, source.blend_weights(scan.points, template.vertices.numpy()))
 
-    return carry
+    return unpose
 
 
 def draw_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> list[Path]:
@@ -150,20 +148,16 @@ def draw_frame(config: CanonicalizeConfig, frames: FrameDataset, index: int) -> 
     after = (canonical.points, canonical.normals, canonical.faces)
     views = [(before, posed, "normals"), (before, posed, grey)]
     views += [(after, front.seen_from(side), colors) for colors in ("normals", tints) for side in ("front", "back")]
-    return [draw_surface(*surface, camera, colors) for surface, camera, colors in views]
-
-
-def draw_surface(
-    points: np.ndarray, normals: np.ndarray, faces: np.ndarray | None, camera: Camera, colors: str | np.ndarray
-) -> np.ndarray:
-    """A picture of a scan of either kind."""
-    if faces is None:
-        return render_points(PointCloud(points, normals), camera, colors)
-    return render_mesh(Mesh(points, faces), camera, colors)
+    return [
+        render_points(PointCloud(points, normals), camera, colors)
+        if faces is None
+        else render_mesh(Mesh(points, faces), camera, colors)
+        for (points, normals, faces), camera, colors in views
+    ]
 
 
 def weight_colors(weights: np.ndarray) -> np.ndarray:
-    """WeightSource weights ``(M, J)`` as colours ``(M, 3)``: each joint has its own, neighbours in number far apart."""
+    """Skinning weights ``(M, J)`` as colours ``(M, 3)``: each joint has its own, neighbours in number far apart."""
     hues = (np.arange(weights.shape[1]) * 0.381966) % 1  # the golden section spreads them
     palette = np.array([colorsys.hsv_to_rgb(hue, 0.75, 0.95) for hue in hues])
     return np.clip(weights @ palette, 0, 1)

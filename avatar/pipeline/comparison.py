@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from avatar.checks import AvatarError, DataError, check_name
+from avatar.data.layouts import find_outfit
+from avatar.data.outfits import Outfit
+from avatar.data.scanner import ScanConfig
 from avatar.environment import prepared_process
-from avatar.evaluation.aggregate import FLOORS, method_key
+from avatar.evaluation.aggregate import FLOORS, method_key, order_methods
 from avatar.evaluation.canonical_scores import canonical_overview, canonical_table
-from avatar.evaluation.curves import plot_fractions, plot_progress, plot_times
 from avatar.evaluation.differences import budget_table, compare_methods, difference_table, differences_csv
 from avatar.evaluation.forms import FormConfig, ReportedTable, form_table, reported_table
 from avatar.evaluation.metrics import find_metrics
-from avatar.evaluation.plots import plot_outfits, save_figure
+from avatar.evaluation.plots import plot_fractions, plot_outfits, plot_progress, plot_times, save_figure
 from avatar.evaluation.scores import Score, Scores, read_scores, write_scores
 from avatar.evaluation.tables import Table, View, outfit_table, to_latex, to_markdown
+from avatar.export.pictures import contact_sheet, frame_camera, render_points, save_picture
 from avatar.io.npz import write_whole
-from avatar.pipeline.pose_grid import draw_pose_grid
-from avatar.pipeline.scores import are_current, read_all_scores, read_floors, scores_file
+from avatar.io.points import read_points
+from avatar.pipeline.scores import are_current, predictions_folder, read_all_scores, read_floors, scores_file
+from avatar.pipeline.surfaces import spaced_frames
+from avatar.progress import tracked
+from avatar.records import PointCloud, Scan
+from avatar.settings import settings_from_dict
 
 log = logging.getLogger(__name__)
+PICTURE = (400, 600)
 
 
 @dataclass
@@ -117,25 +126,25 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
     Raises:
         AvatarError: when there are none, or outfits of one name come from several data sets.
     """
-    scores, homes = Scores(), {}
+    scores, datasets = Scores(), {}
     files = [scores_file(run, split) for run in runs for split in config.splits]
     if old := [str(path) for path in files if path.is_file() and not are_current(path)]:
         log.warning("compare: scored by other code than today's, or edited: %s. Score them again.", ", ".join(old))
     for run in runs:
         mine = read_all_scores(scores_file(run, split) for split in config.splits)
         for row in mine.rows:
-            homes.setdefault(row.outfit, set()).add(row.dataset or dataset_of(run))
+            datasets.setdefault(row.outfit, set()).add(row.dataset or dataset_of(run))
         scores = scores + mine
     if not scores.rows:
         raise AvatarError(f"runs_root: no scores below {config.runs_root}. Run tools/evaluate.py first.")
-    torn = [(outfit, sorted(found)) for outfit, found in homes.items() if len(found) > 1]
-    if torn:
-        raise AvatarError(
-            f"runs: outfit {torn[0][0]!r} is in several data sets ({', '.join(torn[0][1])}) and would share a row. "
-            "Compare one data set at a time."
-        )
+    for outfit, found in datasets.items():
+        if len(found) > 1:
+            raise AvatarError(
+                f"runs: outfit {outfit!r} is in several data sets ({', '.join(sorted(found))}) and would share a row. "
+                "Compare one data set at a time."
+            )
     floors = Scores()
-    for outfit, (dataset,) in sorted(homes.items()):
+    for outfit, (dataset,) in sorted(datasets.items()):
         floors = floors + read_floors(config.runs_root, dataset, outfit, scores.rows)
     whole = floors + scores
     return Scores([replace(row, table=config.table) for row in whole.rows], whole.frames)
@@ -145,8 +154,10 @@ def without_shared_variant(scores: Scores) -> tuple[Scores, str]:
     """The scores without a variant that all trained methods share, and that variant: it tells nothing apart."""
     variants = {row.variant for row in scores.rows if row.method not in FLOORS[:2]}
     shared = variants.pop() if len(variants) == 1 else ""
-    rows = [replace(row, variant="") if row.variant == shared else row for row in scores.rows]
-    frames = [replace(row, variant="") if row.variant == shared else row for row in scores.frames]
+    rows, frames = (
+        [replace(row, variant="") if row.variant == shared else row for row in mine]
+        for mine in (scores.rows, scores.frames)
+    )
     return Scores(rows, frames), shared
 
 
@@ -182,11 +193,8 @@ def side_tables(config: CompareConfig, scores: Scores) -> list[Table]:
     if config.baseline:
         scored = {row.metric for row in scores.frames if row.method not in FLOORS[:2]}  # floors may have more
         metrics = [name for name in config.metrics if name in scored]
-        found = [
-            difference
-            for metric in metrics
-            for difference in compare_methods(scores, metric, config.baseline, config.resamples, config.confidence)
-        ]
+        how = (config.baseline, config.resamples, config.confidence)
+        found = [difference for metric in metrics for difference in compare_methods(scores, metric, *how)]
         write_whole(file_of(config, "differences.csv"), differences_csv(found).encode())
         tables += [difference_table(found, metric) for metric in metrics]
     return tables
@@ -228,3 +236,51 @@ def save_plots(config: CompareConfig, rows: list[Score], runs: tuple[Path, ...])
     for name, figure in figures.items():
         save_figure(figure, file_of(config, f"{name}.png"))
         yield file_of(config, f"{name}.png")
+
+
+def draw_pose_grid(path: Path, runs: Sequence[Path], count: int, split: str, data_root: Path | None = None) -> bool:
+    """Writes the same unseen poses by all methods beside the ground truth, as in CloSET's figure 4.
+
+    Rows are ``count`` evenly spaced poses of every outfit, columns the methods and the truth.
+
+    Args:
+        path: the picture.
+        runs: folders of runs or of scored foreign predictions; what has no predictions of the split is left empty.
+        count: poses an outfit.
+        split: which of the predictions.
+        data_root: where the data are now; where they were at training if None.
+
+    Returns:
+        Whether there were any predictions to draw.
+    """
+    outfits: dict[str, Outfit] = {}
+    folders: dict[str, dict[str, Path]] = {}  # of predictions, by outfit and method
+    for run in runs:
+        settings = yaml.safe_load((run / "config.yaml").read_text()) if (run / "config.yaml").is_file() else {}
+        for name, row in {row.outfit: row for row in read_scores(run / "scores.csv").rows}.items():
+            folder = predictions_folder(run, split, name) if settings else run
+            if not any(folder.glob("*.ply")):
+                continue
+            folders.setdefault(name, {})[method_key(row)] = folder
+            if name not in outfits:
+                root = data_root or Path(settings.get("data_root", "data"))
+                scan = settings_from_dict(ScanConfig, settings.get("scan", {}))
+                outfits[name] = find_outfit(root, row.dataset or str(settings.get("dataset", "sample")), name, scan)
+    methods = order_methods({method for mine in folders.values() for method in mine})
+    rows, labels = [], []
+    for name, outfit in outfits.items():
+        for frame in tracked(spaced_frames(list(outfit.frames(split)), count), f"pictures of {name}", unit="picture"):
+            paths = [folders[name][method] / f"{frame}.ply" if method in folders[name] else None for method in methods]
+            rows.append(draw_pose(outfit.load(split, frame).scan, paths))
+            labels.append(f"{name}: {frame}" if len(outfits) > 1 else frame)
+    if outfits:
+        save_picture(path, contact_sheet(rows, labels, [*methods, "ground truth"]))
+    return bool(outfits)
+
+
+def draw_pose(scan: Scan, predictions: Sequence[Path | None]) -> list[np.ndarray]:
+    """One pose by every method, and its scan, in one framing; blank where there is no prediction."""
+    camera = frame_camera(scan.points, "three_quarter", PICTURE)
+    truth = render_points(PointCloud(scan.points, scan.normals), camera)
+    blank = np.full_like(truth, 255)
+    return [render_points(read_points(p), camera) if p and p.is_file() else blank for p in predictions] + [truth]

@@ -75,7 +75,7 @@ def demo(config: DemoConfig) -> Path:
     require_poisson()
     load_pyvista()
     with stage("canonicalize"):
-        carried = [
+        canonicalized = [
             canonicalize(replace(config.canonicalizer, outfit=outfit, name=settings.canonical, **where))
             for outfit in settings.outfit
         ]
@@ -99,7 +99,7 @@ def demo(config: DemoConfig) -> Path:
         ],
         "made": {
             "report": str(page),
-            "canonical scans": [str(folder / "scans") for folder in carried],
+            "canonical scans": [str(folder / "scans") for folder in canonicalized],
             "points": [str(path) for path in folders],
             "meshes": [str(path) for path in meshes],
             "weights": str(run / "avatar.safetensors"),

@@ -73,13 +73,12 @@ def experiment(config: ExperimentConfig) -> Path:
     Raises:
         AvatarError: before any work, for what prediction, scores or pictures would refuse after training.
     """
-    run, writes = config.run, current_world().is_main
+    is_main = current_world().is_main
     check_job(config)
-    if takes_canonicalizer(run):
-        for outfit in run.outfit:
-            prepare_canonicalizer(config, outfit)
-    folder = train(run)
-    if writes:
+    for outfit in config.outfit if takes_canonicalizer(config.run) else ():
+        prepare_canonicalizer(config, outfit)
+    folder = train(config.run)
+    if is_main:
         score_run(config, folder)
     return folder
 

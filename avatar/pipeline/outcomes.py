@@ -82,9 +82,9 @@ def summarise(outcomes: list[Outcome]) -> str:
     """A count, then one line for every job that did not finish, with the reason."""
     bad = [outcome for outcome in outcomes if outcome.state != State.finished.value]
     counts = {state: sum(outcome.state == state.value for outcome in outcomes) for state in State}
-    words = {State.running: "without a word of their end"}
-    told = [f"{count} {words.get(state, state.value)}" for state, count in counts.items() if count]
-    lines = [f"{len(outcomes)} jobs: {', '.join(told)}."]
+    words = {State.running: "crashed or still running"}
+    parts = [f"{count} {words.get(state, state.value)}" for state, count in counts.items() if count]
+    lines = [f"{len(outcomes)} jobs: {', '.join(parts)}."]
     for outcome in bad:
         why = outcome.why or f"process {outcome.process} on {outcome.machine} died, or is still at work"
         lines.append(f"  {outcome.state}: {outcome.job}: {why}")

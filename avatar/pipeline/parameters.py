@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 from torch import nn
 
+from avatar.evaluation.aggregate import grouped
+from avatar.evaluation.scores import csv_text
 from avatar.evaluation.tables import Table, TableRow, to_markdown
 from avatar.io.npz import write_whole
 from avatar.methods.registry import find_method
@@ -68,28 +68,29 @@ def write_parameters(folder: Path, choices: Mapping[tuple[str, str], MethodChoic
         for (method, size), choice in choices.items()
         for count in count_parameters(method, size, build_network(choice, template))
     ]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("method", "size", "part", "parameters", "original"))
-    writer.writerows((c.method, c.size, c.part, c.parameters, c.original or "") for c in counts)
-    write_whole(folder / "parameters.csv", text.getvalue().encode())
-    markdown = "\n".join(to_markdown(parameter_table(counts, size)) for size in dict.fromkeys(c.size for c in counts))
+    text = csv_text([f.name for f in fields(Count)], ((*astuple(c)[:-1], c.original or "") for c in counts))
+    write_whole(folder / "parameters.csv", text.encode())
+    sizes = grouped(counts, lambda count: count.size)
+    markdown = "\n".join(to_markdown(parameter_table(mine, size)) for size, mine in sizes.items())
     write_whole(folder / "parameters.md", markdown.encode())
     return markdown
 
 
 def parameter_table(counts: list[Count], size: str) -> Table:
     """Methods by parts at one size, with the originals below the methods they are of."""
-    mine = [count for count in counts if count.size == size]
-    parts = list(dict.fromkeys(c.part for c in mine if c.part not in (TOTAL, CODES))) + [TOTAL, CODES]
-    body = []
-    for method in dict.fromkeys(count.method for count in mine):
-        found = {count.part: count for count in mine if count.method == method}
-        lines = [(method, {part: count.parameters for part, count in found.items()})]
-        originals = {part: count.original for part, count in found.items() if count.original}
-        lines += [(f"{method}, original", originals)] if originals else []
-        for label, values in lines:
-            texts = tuple(f"{values[part]:,}" if part in values else "–" for part in parts)
-            body.append(TableRow(label, tuple(values.get(part) for part in parts), texts=texts))
+    parts = [*dict.fromkeys(c.part for c in counts if c.part not in (TOTAL, CODES)), TOTAL, CODES]
+    lines = {}
+    for method, mine in grouped(counts, lambda count: count.method).items():
+        lines[method] = {count.part: count.parameters for count in mine}
+        lines[f"{method}, original"] = {count.part: count.original for count in mine if count.original}
+    body = [
+        TableRow(
+            label,
+            tuple(values.get(part) for part in parts),
+            texts=tuple(f"{values[part]:,}" if part in values else "–" for part in parts),
+        )
+        for label, values in lines.items()
+        if values
+    ]
     notes = ("One outfit on the open body. Skinning fields of canonicalizers are not counted.",)
     return Table(f"parameters, size={size}", "method", tuple(parts), tuple(body), notes)

@@ -13,14 +13,7 @@ from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent
 from avatar.evaluation.scores import Scores
 from avatar.evaluation.tables import View, metric_table, outfit_table
 from avatar.export.drawing import Camera, frame_camera
-from avatar.export.pictures import (
-    color_bar,
-    contact_sheet,
-    render_error,
-    render_mesh,
-    render_points,
-    save_picture,
-)
+from avatar.export.pictures import color_bar, contact_sheet, render_error, render_mesh, render_points, save_picture
 from avatar.geometry.trees import build_tree
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
@@ -28,7 +21,7 @@ from avatar.methods.base import TrainedAvatar
 from avatar.pipeline.scores import floors_root, predictions_folder, read_all_scores, read_floors, run_outfits
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.records import PointCloud
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 
 MAX_ERROR = 0.05  # metres at the hot end of the error pictures
 
@@ -59,7 +52,7 @@ def report(config: ReportConfig) -> Path:
         rows += template_pictures(avatar, outfit)
     save_picture(config.run / "pictures.png", picture_sheet(rows))
     tables = [metric_table(scores.rows, name) for name in dict.fromkeys(row.outfit for row in scores.rows)]
-    if {"sampling"} <= {row.method for row in scores.rows}:
+    if "sampling" in {row.method for row in scores.rows}:
         tables.append(outfit_table(scores.rows, "cd_point", View.EXCESS))
     settings = avatar.config
     content = ReportContent(
@@ -102,31 +95,26 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
     frame = outfit.load(config.split, name)
     scan = frame.scan
     camera = frame_camera(scan.points, "three_quarter")
-    pictures: list[Picture | None] = [
-        Picture(draw_cloud(PointCloud(scan.points, scan.normals, scan.colors), camera), f"scan of {name}"),
-        None,
-        None,
-        None,
-        None,
-    ]
+    truth = draw_cloud(PointCloud(scan.points, scan.normals, scan.colors), camera)
+    pictures = {"ground truth": Picture(truth, f"scan of {name}")}
     path = predictions_folder(config.run, config.split, outfit.name) / f"{name}.ply"
     if path.is_file():
         cloud = read_points(path)
         errors = build_tree(scan.points).query(cloud.points, workers=-1)[0]
         hot = render_error(cloud, errors, MAX_ERROR, camera)
-        pictures[1] = Picture(draw_cloud(cloud, camera), f"predicted points for {name}")
-        pictures[4] = Picture(
+        pictures["prediction"] = Picture(draw_cloud(cloud, camera), f"predicted points for {name}")
+        pictures["error"] = Picture(
             np.concatenate([hot, color_bar(MAX_ERROR, hot.shape[0])], axis=1),
             f"distance of predicted points of {name} to the scan",
             f"mean {errors.mean() * 1000:.1f} mm",
         )
     garment = avatar.method.garment(avatar, outfit.name, 50_000, frame.body)
     if garment is not None:
-        pictures[2] = Picture(render_points(garment, camera), f"garment template posed as {name}")
+        pictures["template"] = Picture(render_points(garment, camera), f"garment template posed as {name}")
     mesh = config.run / "meshes" / config.split / outfit.name / f"{name}.ply"
     if mesh.is_file():
-        pictures[3] = Picture(render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
-    return PictureRow(f"{outfit.name}: {name}", tuple(pictures))
+        pictures["mesh"] = Picture(render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
+    return PictureRow(f"{outfit.name}: {name}", tuple(map(pictures.get, COLUMNS)))
 
 
 def draw_cloud(cloud: PointCloud, camera: Camera) -> np.ndarray:
@@ -154,10 +142,6 @@ def template_pictures(avatar: TrainedAvatar, outfit: Outfit) -> list[PictureRow]
 
 def made_files(run: Path) -> tuple[Path, ...]:
     """What the run made: its files and, for folders of many, the folder."""
-    files = [
-        path for path in sorted(run.iterdir()) if path.is_file() and path.name != "report.html" and path.name[0] != "."
-    ]
-    folders = sorted(
-        {path.parent for kind in ("predictions", "meshes", "export") for path in (run / kind).rglob("*.*")}
-    )
-    return tuple(files + folders)
+    files = [path for path in run.iterdir() if path.is_file() and path.name != "report.html" and path.name[0] != "."]
+    folders = {path.parent for kind in ("predictions", "meshes", "export") for path in (run / kind).rglob("*.*")}
+    return (*sorted(files), *sorted(folders))

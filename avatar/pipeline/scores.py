@@ -13,17 +13,10 @@ from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.environment import prepared_process
-from avatar.evaluation.aggregate import FLOORS, base_method, method_key
+from avatar.evaluation.aggregate import FLOORS, method_key
 from avatar.evaluation.floors import score_body_floor, score_sampling_floor
 from avatar.evaluation.scores import Score, Scores, frames_path, read_scores, write_scores
-from avatar.evaluation.scoring import (
-    SOURCE,
-    Label,
-    ScoreConfig,
-    find_predictions,
-    remember_scores,
-    score_predictions,
-)
+from avatar.evaluation.scoring import SOURCE, Label, ScoreConfig, find_predictions, remember_scores, score_predictions
 from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.documents import read_json
@@ -34,8 +27,8 @@ from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.settings import RunConfig
 from avatar.nn.decoders import Normals
-from avatar.runs.loading import load_avatar
 from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.training import load_avatar
 
 MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
 
@@ -245,9 +238,8 @@ def read_floors(root: Path, dataset: str, outfit: str, rows: Iterable[Score]) ->
 
 def common_points(rows: Iterable[Score], outfit: str) -> int:
     """The point count that most of an outfit's methods predict; of two that as many have, the larger."""
-    methods = {(row.points, method_key(row), row.seed) for row in rows if row.outfit == outfit}
-    methods = {method for method in methods if base_method(method[1]) not in FLOORS[:2]}
-    counts = Counter(points for points, _, _ in methods)
+    mine = (row for row in rows if row.outfit == outfit and row.method not in FLOORS[:2])
+    counts = Counter(points for points, _, _ in {(row.points, method_key(row), row.seed) for row in mine})
     return max(counts, key=lambda points: (counts[points], points))
 
 
@@ -267,17 +259,13 @@ def print_tables(scores: Scores) -> None:
     """Prints every metric of every outfit, and the excess over the sampling floor where floors were scored."""
     for outfit in dict.fromkeys(row.outfit for row in scores.rows):
         print(to_markdown(metric_table(scores.rows, outfit)))
-    methods = {row.method for row in scores.rows}
-    if "sampling" in methods:
+    if "sampling" in {row.method for row in scores.rows}:
         print(to_markdown(outfit_table(scores.rows, "cd_point", View.EXCESS)))
 
 
 def read_all_scores(paths: Iterable[Path]) -> Scores:
     """Scores of several files, joined."""
-    joined = Scores()
-    for path in paths:
-        joined = joined + read_scores(path)
-    return joined
+    return sum(map(read_scores, paths), Scores())
 
 
 def current_commit() -> str:

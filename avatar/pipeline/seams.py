@@ -8,16 +8,26 @@ from pathlib import Path
 from avatar.checks import AvatarError, check_name
 from avatar.data.outfits import Outfit
 from avatar.environment import prepared_process
+from avatar.evaluation.aggregate import grouped
 from avatar.evaluation.scoring import Label
-from avatar.evaluation.seam_tables import SeamTest, check_baseline, name_of, seam_differences, seam_table, to_csv
-from avatar.evaluation.seams import SeamPlaces, measure_seams, seam_places
+from avatar.evaluation.seams import (
+    SeamPlaces,
+    SeamTest,
+    check_baseline,
+    measure_seams,
+    name_of,
+    seam_differences,
+    seam_places,
+    seam_table,
+    seams_csv,
+)
 from avatar.evaluation.tables import Table, to_markdown
 from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
 from avatar.pipeline.scores import current_commit, run_outfits, variant_of
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 
 
 @dataclass
@@ -49,30 +59,28 @@ def seams(config: SeamsConfig) -> Path:
             For bodies without UV coordinates.
     """
     asked = runs_by_outfit(config)
-    for mine in asked.values():
-        if config.baseline:
-            check_baseline([name_of(label_of(config, avatar)) for avatar, _ in mine], config.baseline)
-    tests: dict[tuple[str, str], list[SeamTest]] = {}
-    for key, mine in asked.items():
-        places = seam_places(mine[0][1].template, config.points, config.seed)
-        tests[key] = [probe_seams(config, avatar, outfit, places) for avatar, outfit in mine]
-    every = [test for mine in tests.values() for test in mine]
-    write_whole(config.out / f"{config.table}.csv", to_csv(every).encode())
+    for mine in asked if config.baseline else ():
+        check_baseline([name_of(label_of(config, avatar)) for avatar, _ in mine], config.baseline)
+    every: list[SeamTest] = []
     tables: list[Table] = []
-    for mine in tests.values():
-        tables.append(seam_table(mine))
-        tables += [seam_differences(mine, config.baseline)] if config.baseline else []
+    for mine in asked:
+        places = seam_places(mine[0][1].template, config.points, config.seed)
+        tests = [probe_seams(config, avatar, outfit, places) for avatar, outfit in mine]
+        tables.append(seam_table(tests))
+        tables += [seam_differences(tests, config.baseline)] if config.baseline else []
+        every += tests
+    write_whole(config.out / f"{config.table}.csv", seams_csv(every).encode())
     text = "\n".join(map(to_markdown, tables))
     write_whole(config.out / f"{config.table}.md", text.encode())
     print(f"{text}\nwritten: {config.out / config.table}.*")
     return config.out / f"{config.table}.md"
 
 
-def runs_by_outfit(config: SeamsConfig) -> dict[tuple[str, str], list[tuple[TrainedAvatar, Outfit]]]:
-    """The runs, loaded, under data set and name of each outfit that they were trained on."""
+def runs_by_outfit(config: SeamsConfig) -> list[list[tuple[TrainedAvatar, Outfit]]]:
+    """The runs, loaded, of each outfit that they were trained on."""
     if not config.runs:
         raise AvatarError("runs: expected the folders of trained runs, got none.")
-    found: dict[tuple[str, str], list[tuple[TrainedAvatar, Outfit]]] = {}
+    found = []
     for run in config.runs:
         avatar = load_avatar(run)
         if not avatar.method.on_body:
@@ -80,9 +88,8 @@ def runs_by_outfit(config: SeamsConfig) -> dict[tuple[str, str], list[tuple[Trai
                 f"{run}: expected a method with points at chosen places of the body, got {avatar.method.name}. "
                 "Hint: leave it out."
             )
-        for outfit in run_outfits(avatar, config.data_root):
-            found.setdefault((outfit.dataset, outfit.name), []).append((avatar, outfit))
-    return found
+        found += [(avatar, outfit) for outfit in run_outfits(avatar, config.data_root)]
+    return list(grouped(found, lambda pair: (pair[1].dataset, pair[1].name)).values())
 
 
 def label_of(config: SeamsConfig, avatar: TrainedAvatar) -> Label:

@@ -16,7 +16,7 @@ from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_body_motion
 from avatar.io.points import read_points
 from avatar.pipeline.scores import meshes_folder, predicted_fps, predictions_folder, run_outfits
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 
 
 @dataclass

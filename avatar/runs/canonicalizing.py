@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -44,12 +45,8 @@ SOURCE = ("avatar.canonical.scans", "avatar.canonical.baselines", "avatar.method
 def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None = None) -> Path:
     """Trains a run's canonicalizer, or goes on with it; gives the run's folder. Baselines have nothing to learn.
 
-    Args:
-        config: the run.
-        frames: its frames, where somebody has them in memory already.
-
-    Raises:
-        AvatarError: when the folder holds a run with other settings, or training fails.
+    ``frames`` are the run's, where the caller has them already. Raises `AvatarError` when the folder holds a run with
+    other settings, or training fails.
     """
     require_single_process("canonicalizer")
     frames = frames or config.frames()
@@ -61,10 +58,8 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     learned = [index for index, where in enumerate(frames.names) if where.split == "train"]
     names = [frames.names[index].name for index in learned]
     check_frame_count(names, frames.outfits[0].path / "train", "the canonicalizer")
-    pool = config.train.draw.pool
-    scans = LruSequence(
-        lambda place: prepare_scan(frames.frame(learned[place]), template, pool, config.train.seed), len(learned)
-    )
+    prepare = partial(prepare_scan, template=template, pool=config.train.draw.pool, seed=config.train.seed)
+    scans = LruSequence(lambda place: prepare(frames.frame(learned[place])), len(learned))
     torch.manual_seed(config.train.seed)
     model = Canonicalizer(template, len(scans), config.canonicalizer).to(choose_device(config.device))
     trainer = Trainer(CanonicalizerTask(model, template, scans, names, config.train), config.train, config.folder)
@@ -76,7 +71,7 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
 
 
 def is_trained(config: CanonicalizeConfig) -> bool:
-    """Whether a run's canonicalizer is there, sound and trained to its end."""
+    """Whether a run's canonicalizer is there, valid and trained to its end."""
     try:
         facts = read_weights(config.folder / WEIGHTS, ("steps", "seconds"))[1]
         return spent(config.train, int(facts["steps"]), float(facts["seconds"])) >= 1

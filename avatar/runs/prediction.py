@@ -42,17 +42,10 @@ def predict_frames(
     surface: ExtractionConfig | None = None,
     keep: Callable[[str], bool] = bool,
 ) -> list[Path]:
-    """Writes ``<folder>/<frame>.ply`` for the frames of a split; gives the files in order.
+    """Writes ``<folder>/<frame>.ply`` for those frames of a split that are to ``keep``; gives the files in order.
 
-    Args:
-        avatar: a trained avatar.
-        outfit: one of the outfits it was trained on.
-        split: train, validation or test.
-        folder: where the point clouds go.
-        meshes: where ``<frame>.ply`` with the surface goes, for a method that has one.
-        points: points a frame, 1,000 to 400,000.
-        surface: resolution of an implicit surface.
-        keep: which frames, by name; all of them by default.
+    ``outfit`` is one of those the avatar was trained on, ``points`` a frame are 1,000 to 400,000. A method with a
+    surface, of the resolution ``surface``, writes that to ``<meshes>/<frame>.ply``.
     """
     poses = [
         Pose(name, lambda name=name: outfit.load(split, name).body, outfit.digest(split, name))
@@ -81,7 +74,7 @@ def predict_motion(
         Pose(
             f"{motion.name}.{frame:05d}",
             lambda frame=frame: outfit.fit_pose(motion.poses[frame], motion.translations[frame]),
-            pose_digest(outfit, motion, frame),
+            digest_of([motion.poses[frame].tolist(), motion.translations[frame].tolist(), outfit.shared_digest]),
         )
         for frame in range(len(motion.poses))
     ]
@@ -123,8 +116,3 @@ def avatar_digest(avatar: TrainedAvatar) -> str:
     for name, value in avatar.model.state_dict().items():
         total.update(f"{name} {tuple(value.shape)}".encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return total.hexdigest()
-
-
-def pose_digest(outfit: Outfit, motion: Motion, frame: int) -> str:
-    """One hash over all that the body of a motion's frame depends on: pose, place, and the outfit's shared files."""
-    return digest_of([motion.poses[frame].tolist(), motion.translations[frame].tolist(), outfit.shared_digest])

@@ -1,4 +1,4 @@
-"""Batches prepared ahead of their step, so that a device does not wait for the disk and the processor."""
+"""Inputs of training steps prepared ahead, so that a device does not wait for the disk and the processor."""
 
 from __future__ import annotations
 
@@ -17,20 +17,14 @@ Records = tuple[Any, ...]  # dataclasses of tensors
 class Feed:
     """The inputs of training steps on a device: while a step trains there, a thread prepares those of the next one.
 
-    They are the same as without it, for they follow from the step alone. Used as a ``with`` block, at whose end,
-    whatever ends it, nothing goes on in the background. For CUDA they are copied from pinned memory, beside the work
-    of the step before. On the CPU they are prepared when they are asked for: a thread with work of its own would have
-    OpenMP threads of its own, and OpenMP then lets all of them sleep at once (docs/performance.md).
+    They are the same as without it, for they follow from the step alone. Used as a ``with`` block, at whose end nothing
+    goes on in the background. For CUDA they are copied from pinned memory, beside the work of the step before. On the
+    CPU they are prepared on request: a thread with work of its own would have OpenMP threads of its own, and OpenMP
+    then lets all of them sleep at once (docs/performance.md).
     """
 
     def __init__(self, make: Callable[[int], Records], steps: int, device: torch.device):
-        """Prepares nothing yet.
-
-        Args:
-            make: the inputs of a step; called by one call at a time, and never for two steps past the one at hand.
-            steps: how many there are; none is prepared beyond.
-            device: where they go.
-        """
+        """Prepares nothing yet; ``make`` gives the inputs of a step, by one call at a time, at most one step ahead."""
         self.make, self.steps, self.device = make, steps, device
         self.pinned = device.type == "cuda"
         options = {"initializer": torch.cuda.set_device, "initargs": (device,)} if self.pinned else {}
@@ -59,7 +53,7 @@ class Feed:
 
 
 def pin(tensor: Tensor) -> Tensor:
-    """The tensor in memory that a device can read by itself, where it is the processor's."""
+    """A CPU tensor in page-locked memory; others as they are."""
     return tensor.pin_memory() if tensor.device.type == "cpu" else tensor
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from contextlib import suppress
 from pathlib import Path
 
 from avatar.checks import AvatarError, DataError, require
@@ -16,11 +17,10 @@ class TrainingLog:
     Rows hold ``split`` (train or validation), ``step``, ``epoch``, ``seconds`` and one column for every term.
     """
 
-    def __init__(self, folder: Path, columns: list[str], from_step: int, tensorboard: bool = True):
+    def __init__(self, folder: Path, columns: list[str], from_step: int):
         """Opens the log of a run and drops rows past the step a resumed run starts from.
 
-        Raises:
-            DataError: when the log cannot be written; the one there is stays as it is.
+        Raises `DataError` when the log cannot be written; the one there is stays as it is.
         """
         self.path = folder / "metrics.csv"
         self.columns = ["split", "step", "epoch", "seconds", *columns]
@@ -36,24 +36,16 @@ class TrainingLog:
             raise self._not_written(error) from error
         self.writer = csv.DictWriter(self.file, self.columns, restval="", extrasaction="ignore")
         self.board = None
-        if tensorboard:
-            try:
-                require("tensorboard")
-            except AvatarError:
-                return
+        with suppress(AvatarError):
+            require("tensorboard")
             self.board = require("torch.utils.tensorboard").SummaryWriter(folder / "tensorboard")
 
     def _not_written(self, error: OSError) -> DataError:
-        return DataError(
-            self.path, f"could not be written ({error.strerror}).", "Make room and give the same command again."
-        )
+        hint = "Make room and give the same command again."
+        return DataError(self.path, f"could not be written ({error.strerror}).", hint)
 
     def write(self, split: str, step: int, epoch: int, seconds: float, values: dict[str, float]) -> None:
-        """Writes one row and flushes it.
-
-        Raises:
-            DataError: when the disk refuses.
-        """
+        """Writes one row and flushes it. Raises `DataError` when the disk refuses."""
         row = {"split": split, "step": step, "epoch": epoch, "seconds": f"{seconds:.2f}"}
         try:
             self.writer.writerow(row | {name: f"{value:.6g}" for name, value in values.items()})

@@ -1,4 +1,4 @@
-"""Being asked to stop: SIGINT, SIGTERM and SIGUSR1 are noted, and the work ends where its state can be saved."""
+"""Stop signals: SIGINT, SIGTERM and SIGUSR1 are noted, and the work ends where its state can be saved."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Stopped(Exception):
 
 @contextmanager
 def listening(listener: Callable[[int, FrameType | None], Any], numbers: Iterable[int]) -> Iterator[dict[int, Any]]:
-    """Has signals heard by a function for the length of a ``with`` block; gives who listened before.
+    """Has signals handled by a function for the length of a ``with`` block; gives the earlier handlers.
 
-    Outside the main thread Python has no signals: nothing is heard then.
+    Outside the main thread Python has no signals.
     """
     ours = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, listener) for number in numbers} if ours else {}
@@ -49,9 +49,9 @@ def answer_interrupt(number: int, answer: str) -> None:
 
 @contextmanager
 def leave_when_asked(passed_on: Callable[[int], bool] = lambda number: False) -> Iterator[None]:
-    """Leaves with exit code 75 when asked to stop, but when ``passed_on`` says that others do in this one's place.
+    """Leaves with exit code 75 when asked to stop, unless ``passed_on`` has passed the signal on to other processes.
 
-    Others get SIGTERM for a Ctrl-C, which their terminal may have sent them already: a second would end them at once.
+    They get SIGTERM for a Ctrl-C, which their terminal may have sent them already: a second would end them at once.
     """
 
     def leave(number: int, frame: FrameType | None) -> None:
@@ -74,18 +74,14 @@ class StopRequest:
         self.earlier: dict[int, Any] = {}
 
     def note(self, number: int, frame: FrameType | None) -> None:
-        """Keeps the first signal; those that follow change nothing, so that a save is never cut short.
-
-        A second Ctrl-C alone ends the process; what was saved before stays whole.
-        """
+        """Keeps the first signal, so that a save is never cut short; only a second Ctrl-C ends the process at once."""
         self.number = self.number or number
         answer_interrupt(number, "Stopping: this step is finished and saved.")
 
     def leave(self, folder: Path) -> None:
         """Ends the work once its state is saved; who listened to SIGUSR2 before hears it now.
 
-        Raises:
-            Stopped: always, unless the earlier listener leaves on its own.
+        Raises `Stopped` always, unless the earlier listener leaves on its own.
         """
         if self.number == signal.SIGUSR2:
             self.earlier[self.number](self.number, None)

@@ -8,7 +8,7 @@ import time
 from contextlib import nullcontext
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from avatar.checks import AvatarError, DataError
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Task
-from avatar.nn.shared_norm import synchronize_norms
+from avatar.nn.layers import synchronize_norms
 from avatar.progress import Progress
 from avatar.records import LossTerms
 from avatar.training.feeding import Feed, to_device
@@ -31,7 +31,7 @@ report = logging.getLogger(__name__)
 
 
 class Budget(Protocol):
-    """Settings of training that do not depend on the method; ``minutes``, if not None, may end it before ``steps``."""
+    """Settings of training of any method; ``minutes``, if not None, may end it before ``steps``."""
 
     steps: int
     minutes: float | None
@@ -46,13 +46,7 @@ class Trainer:
     """Trains a task in a run's folder; started again, it resumes from the newest valid checkpoint, equal to the bit."""
 
     def __init__(self, task: Task, budget: Budget, folder: Path):
-        """Prepares training; under torchrun, as one rank of several.
-
-        Args:
-            task: the network, its inputs and its loss.
-            budget: steps or minutes, and how often to log, validate and save.
-            folder: the run's folder; ``metrics.csv`` and ``checkpoints/`` go there.
-        """
+        """Prepares training, under torchrun as one rank of several; the run's files go to ``folder``."""
         self.task, self.budget, self.folder, self.model = task, budget, folder, task.model
         self.device = next(self.model.parameters()).device
         self.world = current_world()
@@ -67,9 +61,8 @@ class Trainer:
     def fit(self) -> None:
         """Trains until the budget is spent; holds the lock of the run's folder while it does.
 
-        Raises:
-            AvatarError: when losses or gradients stay non-finite, or another job holds the folder.
-            Stopped: after SIGTERM or SIGUSR1, with everything saved.
+        Raises `AvatarError` when losses or gradients stay non-finite, or another job holds the folder. Raises `Stopped`
+        after SIGTERM or SIGUSR1, with everything saved.
         """
         with lock_folder(self.folder) if self.world.is_main else nullcontext(), stop_requests() as stop:
             self.resume()
@@ -108,7 +101,7 @@ class Trainer:
                     stop.leave(self.folder)
 
     def write(self, log: TrainingLog | None, split: str, values: dict[str, float]) -> None:
-        """Writes one row of the log, on the main rank and where there are values."""
+        """Writes one row of the log on the main rank."""
         if log and values:
             epoch = self.step * self.task.batch // self.task.frames
             log.write(split, self.step, epoch, self.seconds, values)
@@ -176,11 +169,9 @@ class Trainer:
             statistic.copy_(value)
         self.bad_steps += 1
         if self.bad_steps > MAX_BAD_STEPS:
-            raise AvatarError(
-                f"loss: not finite for {self.bad_steps} steps in a row (step {self.step}, frames "
-                f"{', '.join(self.task.frame_names(inputs))}). Hint: lower the learning rate or check these frames; "
-                "the last checkpoint is valid."
-            )
+            where = f"(step {self.step}, frames {', '.join(self.task.frame_names(inputs))})"
+            hint = "lower the learning rate or check these frames; the last checkpoint is valid."
+            raise AvatarError(f"loss: not finite for {self.bad_steps} steps in a row {where}. Hint: {hint}")
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -199,17 +190,11 @@ class Trainer:
         return {name: sum(each.get(name, 0.0) for each, _ in every) / frames for name in every[0][0]}
 
     def save(self, score: float | None) -> None:
-        """Writes a checkpoint; the main rank does, with the random state of all."""
-        state = self.state()
-        if self.world.is_main:
-            save_checkpoint(self.folder / "checkpoints", state, self.step, score)
-
-    def state(self) -> dict[str, Any]:
-        """Everything a resumed run needs: tensors and plain values."""
+        """Writes a checkpoint of all that a resumed run needs; the main rank does, with the random state of all."""
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
-        return {
+        state = {
             "format": FORMAT,
             "model": self.model.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -219,12 +204,13 @@ class Trainer:
             "random": gather(random, self.world),
             "threads": torch.get_num_threads(),
         }
+        if self.world.is_main:
+            save_checkpoint(self.folder / "checkpoints", state, self.step, score)
 
     def resume(self) -> None:
         """Goes back to the newest valid checkpoint; seeds the random state when there is none.
 
-        Raises:
-            DataError: for a checkpoint of an earlier version's trainer, or of another run.
+        Raises `DataError` for a checkpoint of an earlier version's trainer, or of another run.
         """
         world, folder = self.world, self.folder / "checkpoints"
         state = broadcast(load_checkpoint(folder) if world.is_main else None, world)
@@ -234,28 +220,20 @@ class Trainer:
             self.model.load_state_dict(broadcast(weights, world))
             return
         if state.get("format") != FORMAT:
-            raise DataError(
-                folder,
-                f"expected checkpoints of format {FORMAT}, got {state.get('format', 1)}, of an earlier version.",
-                "Train it anew under another name (name=...); finished weights are still read.",
-            )
+            problem = f"expected checkpoints of format {FORMAT}, got {state.get('format', 1)}, of an earlier version."
+            hint = "Train it anew under another name (name=...); finished weights are still read."
+            raise DataError(folder, problem, hint)
         with restoring(folder):
-            self.restore(state)
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Restores a checkpoint's state."""
-        world = self.world
-        self.model.load_state_dict(state["model"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.stage, self.seconds = int(state["step"]), int(state["stage"]), float(state["seconds"])
-        before = (state["threads"], len(state["random"]))
-        if before != (torch.get_num_threads(), world.size):
-            report.info("Resuming with other threads or processes than before: equal to rounding, not to the bit.")
-        if len(state["random"]) == world.size:
-            random = state["random"][world.rank]
-            torch.set_rng_state(random["cpu"])
-            if "cuda" in random and self.device.type == "cuda":
-                torch.cuda.set_rng_state(random["cuda"], self.device)
+            self.model.load_state_dict(state["model"])
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.step, self.stage, self.seconds = int(state["step"]), int(state["stage"]), float(state["seconds"])
+            if (state["threads"], len(state["random"])) != (torch.get_num_threads(), world.size):
+                report.info("Resuming with other threads or processes than before: equal to rounding, not to the bit.")
+            if len(state["random"]) == world.size:
+                random = state["random"][world.rank]
+                torch.set_rng_state(random["cpu"])
+                if "cuda" in random and self.device.type == "cuda":
+                    torch.cuda.set_rng_state(random["cuda"], self.device)
 
 
 def spent(budget: Budget, steps: int, seconds: float) -> float:

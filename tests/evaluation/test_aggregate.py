@@ -6,9 +6,10 @@ import pytest
 from avatar.checks import AvatarError
 from avatar.evaluation.aggregate import (
     Cell,
-    bootstrap_difference,
+    bootstrap_mean,
     frame_weighted_mean,
     order_methods,
+    paired_differences,
     tabulate,
     worst_outfit,
 )
@@ -21,6 +22,10 @@ def score(outfit, method, value, frames=10, seed=0, variant=""):
 
 def frames_of(method, values, outfit="dress"):
     return [FrameScore(outfit, method, "", 0, f"a.{i:04d}", "cd_point", float(v)) for i, v in enumerate(values)]
+
+
+def bootstrap_difference(frames, metric, first, second, **options):
+    return bootstrap_mean(paired_differences(frames, metric, first, second).values(), **options)
 
 
 def test_mean_counts_frames_and_max_counts_outfits():
@@ -71,6 +76,5 @@ def test_interval_is_paired_weighted_by_frames_and_repeats():
     assert first == same != bootstrap_difference(noisy, "cd_point", "a", "b", seed=5)
 
 
-def test_methods_without_common_frames_are_refused():
-    with pytest.raises(AvatarError, match="a and c have no frame"):
-        bootstrap_difference(frames_of("a", [1, 2]), "cd_point", "a", "c")
+def test_methods_without_common_frames_have_no_difference():
+    assert paired_differences(frames_of("a", [1, 2]), "cd_point", "a", "c") == {}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from avatar.evaluation.curves import plot_fractions, plot_progress, plot_times
+from avatar.evaluation.plots import plot_fractions, plot_progress, plot_times
 from avatar.evaluation.scores import Score
 
 LOG = "split,step,seconds,chamfer\ntrain,1,30,9e-4\nvalidation,1,60,5e-4\nvalidation,2,120,4e-4\n"

@@ -29,10 +29,10 @@ def test_sampling_floor_shrinks_with_the_count(ball):
 def test_sampling_floor_is_the_spacing_of_random_points(ball):
     """Mean squared distance to the nearest of N independent points on area A is A / (pi N)."""
     ball.points = 5000
-    scores = score_sampling_floor(ball, "test", CONFIG, 5000, table="main", commit="abc")
+    scores = score_sampling_floor(ball, "test", CONFIG, 5000, commit="abc")
     assert values(scores)["cd_point"] == pytest.approx(2 * 4 / 5000, rel=0.05)
     row = scores.rows[0]
-    assert (row.method, row.variant, row.points, row.table, row.commit) == ("sampling", "", 5000, "main", "abc")
+    assert (row.method, row.variant, row.points, row.commit) == ("sampling", "", 5000, "abc")
     assert values(scores)["penetration_share"] == 0
     assert "jitter" not in values(scores)  # its points are drawn anew each frame
 

@@ -9,8 +9,20 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from avatar.checks import AvatarError
-from avatar.evaluation.comparison import PENETRATION_POINTS, Comparison
-from avatar.evaluation.metrics import METRICS, f_score, find_metrics, mean_acceleration, neighbour_spread, scan_to_discs
+from avatar.evaluation.metrics import (
+    DISC_NEIGHBOURS,
+    METRIC_NAMES,
+    METRICS,
+    PENETRATION_POINTS,
+    SKIN_TOLERANCE,
+    SPREAD_NEIGHBOURS,
+    Comparison,
+    f_score,
+    find_metrics,
+    mean_acceleration,
+    neighbour_spread,
+    scan_to_discs,
+)
 from avatar.records import Mesh, PointCloud, Scan
 
 FRAME_METRICS = [name for name, metric in METRICS.items() if not metric.sequential]
@@ -229,9 +241,17 @@ def test_unknown_metrics_are_named_with_all_there_are():
 
 
 def test_every_metric_is_defined():
+    assert tuple(METRICS) == METRIC_NAMES
     for name, metric in METRICS.items():
         assert metric.name == name
         assert len(metric.definition) > 40 and metric.definition.endswith(".")
+    defined = {
+        "s2m_cm": f"distance to {DISC_NEIGHBOURS} neighbours",
+        "uniformity": f"distance to {SPREAD_NEIGHBOURS} nearest neighbours",
+        "penetration_share": f"more than {1e3 * SKIN_TOLERANCE:g} mm under",
+    }
+    assert all(part in METRICS[name].definition for name, part in defined.items())
+    assert f"at most {PENETRATION_POINTS:,} points" in METRICS["penetration_share"].definition
 
 
 @pytest.mark.parametrize(
@@ -244,7 +264,7 @@ def test_every_metric_is_defined():
         (np.zeros((2, 3)), np.zeros((2, 3)), "2 of 2 without length"),
     ],
 )
-def test_unsound_predictions_are_refused(points, normals, message):
+def test_invalid_predictions_are_refused(points, normals, message):
     with pytest.raises(AvatarError, match=message):
         compare((points, normals), plane())
 

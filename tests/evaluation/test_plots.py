@@ -6,9 +6,9 @@ from xml.etree import ElementTree
 import pytest
 from matplotlib.figure import Figure
 
-from avatar.checks import AvatarError, DataError
-from avatar.evaluation.plots import inline_svg, plot_frames, plot_losses, plot_outfits, save_figure
-from avatar.evaluation.scores import FrameScore, Score
+from avatar.checks import DataError
+from avatar.evaluation.plots import inline_svg, plot_losses, plot_outfits, save_figure
+from avatar.evaluation.scores import Score
 
 LOG = "split,step,epoch,seconds,total,chamfer\ntrain,1,0,0.1,4,3\nvalidation,1,0,0.2,,5\ntrain,2,0,0.3,0.1,2\n"
 
@@ -54,17 +54,6 @@ def test_outfits_are_bars_of_displayed_values():
     body, pop = panel.containers
     assert (body.get_label(), [bar.get_height() for bar in body]) == ("body", pytest.approx([9]))
     assert [bar.get_height() for bar in pop] == pytest.approx([1, 2])
-
-
-def test_frames_are_lines_and_gaps_stay_gaps():
-    frames = [FrameScore("a", "pop", "", 0, name, "cd_point", 1e-4) for name in ("w.1", "w.3")]
-    frames.append(FrameScore("a", "closet", "", 0, "w.2", "cd_point", 2e-4))
-    (panel,) = plot_frames(frames, "cd_point", "a").axes
-    closet, pop = (line.get_ydata() for line in panel.lines)
-    assert closet[1] == pytest.approx(2) and pop[[0, 2]] == pytest.approx([1, 1])
-    assert (closet != closet).tolist() == [True, False, True]
-    with pytest.raises(AvatarError, match="no score of cd_pop on a"):
-        plot_frames(frames, "cd_pop", "a")
 
 
 def test_svg_is_inline_ready(log):

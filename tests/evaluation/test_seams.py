@@ -8,18 +8,21 @@ import torch
 
 from avatar.checks import AvatarError
 from avatar.evaluation.scoring import Label
-from avatar.evaluation.seam_tables import SeamTest, seam_differences, seam_table, to_csv
 from avatar.evaluation.seams import (
     BODY,
     OTHERS,
     SEAMS,
     SeamKey,
+    SeamTest,
     angles_between,
     edge_sides,
     measure_seams,
     point_errors,
+    seam_differences,
     seam_distance,
     seam_places,
+    seam_table,
+    seams_csv,
 )
 from avatar.geometry.surface import interpolate
 from avatar.geometry.uv import sample_uv, seam_edges
@@ -166,7 +169,7 @@ def test_tables_and_differences_are_at_the_same_places():
 
 def test_rows_are_tidy():
     (pop,) = [probe("pop", JUMP, (0.003,), "12.5%")]
-    rows = list(csv.DictReader(to_csv([pop]).splitlines()))
+    rows = list(csv.DictReader(seams_csv([pop]).splitlines()))
     jump = next(row for row in rows if (row["metric"], row["where"]) == ("jump", "seams"))
     assert float(jump["value"]) == pytest.approx(JUMP, rel=1e-5) and jump["unit"] == "m"
     assert (jump["method"], jump["variant"], jump["steps"], jump["frames"]) == ("pop", "12.5%", "7", "1")

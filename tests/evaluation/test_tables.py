@@ -1,6 +1,5 @@
-"""Tables: numbers, floors, definitions and the three formats."""
+"""Tables: numbers, floors, definitions and the two formats."""
 
-import csv
 from dataclasses import replace
 
 import pytest
@@ -8,7 +7,7 @@ import pytest
 from avatar.checks import AvatarError
 from avatar.evaluation.metrics import METRICS
 from avatar.evaluation.scores import Score
-from avatar.evaluation.tables import Table, TableRow, View, metric_table, outfit_table, to_csv, to_latex, to_markdown
+from avatar.evaluation.tables import Table, TableRow, View, metric_table, outfit_table, to_latex, to_markdown
 
 VALUES = {
     "dress": {"sampling": 1e-4, "body": 21e-4, "static": 6e-4, "closet": 5e-4},
@@ -110,12 +109,6 @@ def test_markdown():
     assert text[-1].startswith("- Floors") and any(METRICS["cd_point"].definition in line for line in text)
 
 
-def test_csv_keeps_full_precision():
-    lines = list(csv.reader(to_csv(outfit_table(some_rows(), "cd_point")).splitlines()))
-    assert lines[0] == ["outfit", "sampling", "body", "static", "closet"]
-    assert float(lines[1][4]) == 5e-4 * 1e4
-
-
 def test_latex_is_escaped_and_complete():
     text = to_latex(outfit_table(some_rows(), "cd_point"))
     assert "long\\_shirt & 1.000 & 5.000 & 3.000 & 2.000 \\\\" in text
@@ -127,7 +120,6 @@ def test_grouped_columns_have_one_heading_in_latex_and_full_names_elsewhere():
     rows = (TableRow("pop", (1.0, 2.0, 3.0)),)
     table = Table("t", "method", ("mean", "max", "mean"), rows, (), ("CD_1", "CD_1", "NML"))
     assert "| method | CD_1, mean | CD_1, max | NML, mean |" in to_markdown(table)
-    assert to_csv(table).startswith('method,"CD_1, mean","CD_1, max","NML, mean"')
     lines = to_latex(table).splitlines()
     start = lines.index("\\toprule")
     assert lines[start + 1 : start + 4] == [

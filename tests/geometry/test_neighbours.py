@@ -9,7 +9,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import ball_loop, nearest_loop
-from torch.utils._pytree import tree_map
 
 from avatar.checks import AvatarError
 from avatar.geometry import neighbours
@@ -17,9 +16,9 @@ from avatar.geometry.neighbours import (
     FixedPoints,
     _k_nearest_chunked,
     ball_query,
+    correspond,
     k_nearest,
     nearest,
-    nearest_both_ways,
 )
 from avatar.geometry.trees import build_tree
 
@@ -43,7 +42,8 @@ def test_k_nearest_agrees_with_loop(queries, points, seed):
 @given(st.integers(1, 200), st.integers(1, 200), st.integers(0, 1000))
 def test_both_ways_agree_with_loop(points, others, seed):
     p, q = cloud(2, points, seed), cloud(2, others, seed + 1)
-    there, back = nearest_both_ways(p, q)
+    found = correspond(p, q)
+    there, back = found.scan_of_point, found.point_of_scan
     for b, (first, second) in enumerate(zip(p.double().numpy(), q.double().numpy())):
         np.testing.assert_array_equal(there[b, :, None].numpy(), nearest_loop(first, second, 1))
         np.testing.assert_array_equal(back[b, :, None].numpy(), nearest_loop(second, first, 1))
@@ -94,7 +94,7 @@ def test_non_finite_coordinates_are_refused(bad, where):
     with pytest.raises(AvatarError, match="finite"):
         nearest(q, p)
     with pytest.raises(AvatarError, match="finite"):
-        nearest_both_ways(q, p)
+        correspond(q, p)
 
 
 def test_chunked_search_carries_nan_through_with_indices_in_range():
@@ -152,9 +152,10 @@ def test_fixed_points_are_searched_as_others_and_their_tree_is_built_once(monkey
 
 
 @pytest.mark.pretended
-@pytest.mark.parametrize("search", [k_nearest, nearest_both_ways])
+@pytest.mark.parametrize("search", [k_nearest, correspond])
 def test_a_device_searches_by_itself(search):
     points, queries = cloud(2, 50, 0), cloud(2, 40, 1)
     more = (3,) if search is k_nearest else ()
-    there = search(queries.to(pretended.NAME), points.to(pretended.NAME), *more)
-    torch.testing.assert_close(tree_map(torch.Tensor.cpu, there), search(queries, points, *more))
+    there, here = search(queries.to(pretended.NAME), points.to(pretended.NAME), *more), search(queries, points, *more)
+    for found, expected in [(there, here)] if search is k_nearest else zip(vars(there).values(), vars(here).values()):
+        torch.testing.assert_close(found.cpu(), expected)

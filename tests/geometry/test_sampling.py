@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from reference import farthest_loop
 
 from avatar.checks import AvatarError
-from avatar.geometry.sampling import farthest_points
+from avatar.geometry.surface import farthest_points
 
 
 @settings(max_examples=20, deadline=None)

@@ -33,9 +33,8 @@ from avatar.methods.canonicalizer import (
     WeightSource,
     fit_latent,
     load_canonicalizer,
-    rate_factor,
 )
-from avatar.pipeline.canonicalization import canonicalize, carrier, score_canonical_scans, weight_colors
+from avatar.pipeline.canonicalization import canonicalize, canonicalizer_with, score_canonical_scans, weight_colors
 from avatar.runs.canonicalizing import canonicalize_frames, skinning_source, train_canonicalizer
 from avatar.training.logs import read_log
 from avatar.training.trainer import Trainer
@@ -124,7 +123,7 @@ def test_every_scan_is_seen_once_an_epoch_in_an_order_that_changes(tmp_path):
 
 
 def test_rates_fall_at_half_and_three_quarters():
-    assert [rate_factor(share, 0.1) for share in (0, 0.49, 0.5, 0.74, 0.75, 1)] == pytest.approx(
+    assert [CycleConfig(decay=0.1).rate_factor(0, share) for share in (0, 0.49, 0.5, 0.74, 0.75, 1)] == pytest.approx(
         [1, 1, 0.1, 0.1, 0.01, 0.01]
     )
 
@@ -369,7 +368,7 @@ def test_a_run_is_scored_against_the_truth_beside_its_rivals(settings, folder):
     assert all(len({f.frame for f in scores.frames if f.variant == split}) == 2 for split in ("train", "test"))
     assert values["nearest", "train", "cycle_cm"] != values["learned", "train", "cycle_cm"]
     frame = settings.frames().frame(0)
-    back = carrier(settings, skinning_source(settings, read_template(folder / "template.npz")))(frame)
+    back = canonicalizer_with(settings, skinning_source(settings, read_template(folder / "template.npz")))(frame)
     assert np.allclose(back.forward_weights.sum(axis=1), 1, atol=1e-5)
     assert "| truth_cm (cm) |" in (folder / "scores.md").read_text()
 

@@ -14,9 +14,9 @@ from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.methods.closet import ClosetAvatar, ClosetConfig, PoseLocality, Skinning
 from avatar.methods.registry import find_method
 from avatar.nn.decoders import Decoded
+from avatar.nn.encoders import PointNet2Config
 from avatar.nn.hierarchy import HierarchyConfig
 from avatar.nn.locality import LocalPoseConfig
-from avatar.nn.pointnet2 import PointNet2Config
 from avatar.nn.posing import LearnedSkinning
 from avatar.records import Batch
 
@@ -74,7 +74,7 @@ def test_template_is_one_for_all_poses_and_differs_by_outfit():
     assert (prediction.wrinkle_offsets[0] - prediction.wrinkle_offsets[2]).abs().max() > 0
     template = model.garment_template(0, samples)
     resting = interpolate(TEMPLATE.vertices, samples)
-    torch.testing.assert_close(template.offsets[0], resting + prediction.garment_offsets[0])
+    torch.testing.assert_close(template.points[0], resting + prediction.garment_offsets[0])
 
 
 def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
@@ -85,7 +85,7 @@ def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
     prediction = model(batch, samples)
     scale, skin = model.config.offset_scale, vertex_normals(TEMPLATE.vertices, TEMPLATE.faces)
     for frame, outfit in enumerate(batch.outfit_ids):
-        garment = model.surface_features(model.codes[None, outfit], samples)
+        garment = model.garment_features(model.codes[None, outfit], samples)
         places = interpolate(TEMPLATE.vertices, samples)
         pose = interpolate(model.pose_encoder(batch.pose_vertices[None, frame]), samples)
         template = model.garment_decoder(garment, places)
@@ -111,7 +111,7 @@ def test_the_garment_template_is_the_prediction_at_rest_without_wrinkles():
     expected = model(rest, samples, wrinkles=False)
     for frame, outfit in enumerate(batch.outfit_ids.tolist()):
         template = model.garment_template(outfit, samples)
-        torch.testing.assert_close(template.offsets[0], expected.points[frame])
+        torch.testing.assert_close(template.points[0], expected.points[frame])
         torch.testing.assert_close(template.normals[0], expected.normals[frame])
     bare = silence(model).garment_template(0, samples).normals  # a correction of the body's own
     skin = torch.nn.functional.normalize(interpolate(TEMPLATE.vertices, samples), dim=-1)
@@ -281,7 +281,7 @@ def test_half_precision_ends_before_posing(skinning):
     with torch.autocast("cpu", torch.bfloat16):
         prediction = model(batch, samples)
     again = model.pose_points(Decoded(prediction.offsets, prediction.offsets), batch, samples)
-    torch.testing.assert_close(prediction.points, again.offsets, atol=1e-6, rtol=0)
+    torch.testing.assert_close(prediction.points, again.points, atol=1e-6, rtol=0)
 
 
 def test_a_turned_wrist_is_felt_at_the_foot_by_the_global_encoder_only():

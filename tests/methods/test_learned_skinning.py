@@ -24,7 +24,7 @@ from avatar.methods.closet import learned_skinning
 from avatar.methods.losses import LossConfig
 from avatar.methods.points import body_batch, predict
 from avatar.methods.settings import MethodChoice, RunConfig, Schedule, Space
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
 
 FIELD = SkinningFieldConfig(width=16, layers=2, skip=1, orders=1)

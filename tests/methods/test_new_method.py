@@ -14,7 +14,8 @@ from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.evaluation.scoring import ScoreConfig
-from avatar.geometry.distances import correspond, point_to_point
+from avatar.geometry.distances import point_to_point
+from avatar.geometry.neighbours import correspond
 from avatar.geometry.sparse import gather_rows
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import transform_directions
@@ -27,7 +28,7 @@ from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import MeshConfig, mesh
 from avatar.records import LossTerms, Mesh, Surface
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
 from avatar.training.logs import read_log
 

@@ -209,7 +209,7 @@ def test_the_garment_template_is_the_prediction_at_rest_without_wrinkles():
     expected = model(rest, samples, wrinkles=False)
     for frame, outfit in enumerate(batch.outfit_ids.tolist()):
         template = model.garment_template(outfit, samples)
-        torch.testing.assert_close(template.offsets[0], expected.points[frame])
+        torch.testing.assert_close(template.points[0], expected.points[frame])
         torch.testing.assert_close(template.normals[0], expected.normals[frame])
 
 
@@ -240,7 +240,7 @@ def test_explicit_template_is_one_for_all_poses():
     assert torch.linalg.det(spanned).abs().max() < 1e-5  # n is garment's plus what the pose adds, up to length
     template = model.garment_template(1, samples)
     resting = interpolate(ATLASED.vertices, samples)
-    torch.testing.assert_close(template.offsets[0], resting + prediction.garment_offsets[1])
+    torch.testing.assert_close(template.points[0], resting + prediction.garment_offsets[1])
     plain = avatar()
     assert plain(batch, samples).garment_offsets is None
     for refused in (lambda: plain(batch, samples, wrinkles=False), lambda: plain.garment_template(0, samples)):

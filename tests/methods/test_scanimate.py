@@ -23,8 +23,8 @@ from avatar.methods.scanimate import ImplicitTask, ImplicitTrainConfig
 from avatar.methods.settings import MethodChoice, Precision, RunConfig, Schedule, TrainConfig
 from avatar.records import Scan
 from avatar.runs.canonicalizing import train_canonicalizer
-from avatar.runs.loading import load_avatar
 from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_to_dict
 from avatar.simulate.sequences import authored_motion

@@ -4,7 +4,7 @@ import torch
 from torch.nn.functional import batch_norm, linear, softplus
 
 from avatar.nn.decoders import DecoderConfig, ShapeDecoder
-from avatar.nn.pointnet2 import PointNorm
+from avatar.nn.layers import PointNorm
 
 
 def test_decoder_written_out():

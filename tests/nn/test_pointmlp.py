@@ -8,10 +8,16 @@ import yaml
 from spheres import TEMPLATE, sphere_template
 
 from avatar.methods.closet import FULL_GARMENT_ENCODER
-from avatar.nn.encoders import ENCODERS, Encoder, build_encoder
+from avatar.nn.encoders import (
+    ENCODERS,
+    Encoder,
+    GeometricAffine,
+    PointMLP,
+    PointMLPLevel,
+    PointNet2Config,
+    ResidualPointMLP,
+)
 from avatar.nn.hierarchy import HierarchyConfig, build_levels
-from avatar.nn.pointmlp import GeometricAffine, PointMLP, PointMLPLevel, ResidualPointMLP
-from avatar.nn.pointnet2 import PointNet2Config
 
 CONF = Path(__file__).parents[2] / "conf"
 SIZES = HierarchyConfig(points=(40, 10), radii=(0.5, 1.5), neighbours=6)
@@ -38,8 +44,8 @@ def preset(kind: str, size: str, part: str) -> PointNet2Config:
 @pytest.mark.parametrize("kind", ["pointmlp", "pointnext"])
 def test_presets_have_about_as_many_parameters_as_pointnet2(kind, size, part, channels):
     channels = channels if isinstance(channels, int) else channels[size]
-    ours = parameters(build_encoder(Encoder(kind), TEMPLATE, channels, preset(kind, size, part)))
-    theirs = parameters(build_encoder(Encoder.pointnet2, TEMPLATE, channels, preset("pointnet2", size, part)))
+    ours = parameters(ENCODERS[Encoder(kind)](TEMPLATE, channels, preset(kind, size, part)))
+    theirs = parameters(ENCODERS[Encoder.pointnet2](TEMPLATE, channels, preset("pointnet2", size, part)))
     assert abs(ours / theirs - 1) < 0.07
 
 
@@ -96,7 +102,7 @@ def test_every_encoder_keeps_the_same_contract(kind):
     torch.manual_seed(0)
     levels = HierarchyConfig((40, 10), (0.5, 2.5), 40)
     config = PointNet2Config(levels, ((5, 8), (6, 12)), ((8,), (4,)))
-    encoder = build_encoder(kind, TEMPLATE, 3, config)
+    encoder = ENCODERS[kind](TEMPLATE, 3, config)
     assert type(encoder) is ENCODERS[kind]
     assert (encoder.channels, encoder.out_channels) == (3, 4)
     features = torch.randn(3, 162, 3, requires_grad=True)
@@ -110,10 +116,10 @@ def test_every_encoder_keeps_the_same_contract(kind):
     moved = features.detach().clone()
     moved[0, TEMPLATE.vertices[:, 1].argmax()] += 10
     assert (encoder(moved)[0] - together[0]).abs()[TEMPLATE.vertices[:, 1] < -0.5].max() > 0  # far parts do
-    again = build_encoder(kind, TEMPLATE, 3, config)
+    again = ENCODERS[kind](TEMPLATE, 3, config)
     again.load_state_dict(encoder.state_dict())
     torch.testing.assert_close(again.eval()(features), together)
 
 
 def test_pointmlp_is_what_the_switch_gives():
-    assert isinstance(build_encoder(Encoder.pointmlp, TEMPLATE, 3, SMALL), PointMLP)
+    assert isinstance(ENCODERS[Encoder.pointmlp](TEMPLATE, 3, SMALL), PointMLP)

@@ -9,8 +9,8 @@ from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.methods.closet import FULL_GARMENT_ENCODER, ClosetConfig
 from avatar.nn.decoders import DecoderConfig, ShapeDecoder
+from avatar.nn.encoders import FeaturePropagation, PointNet2, PointNet2Config, SetAbstraction
 from avatar.nn.hierarchy import HierarchyConfig, build_levels
-from avatar.nn.pointnet2 import FeaturePropagation, PointNet2, PointNet2Config, SetAbstraction
 
 SIZES = HierarchyConfig(points=(40, 10), radii=(0.5, 1.5), neighbours=6)
 

@@ -4,9 +4,8 @@ import torch
 from spheres import TEMPLATE, sphere_template
 
 from avatar.geometry.neighbours import ball_query
+from avatar.nn.encoders import InvertedResidual, Neighbourhoods, PointNet2Config, PointNeXt
 from avatar.nn.hierarchy import HierarchyConfig, build_levels
-from avatar.nn.pointnet2 import PointNet2Config
-from avatar.nn.pointnext import InvertedResidual, Neighbourhoods, PointNeXt
 
 SIZES = HierarchyConfig(points=(40, 10), radii=(0.5, 1.5), neighbours=6)
 WIDE = HierarchyConfig(points=(40, 10), radii=(0.5, 0.9), neighbours=40)  # all that a ball holds

@@ -15,10 +15,10 @@ from avatar.methods.closet import ClosetAvatar, ClosetConfig, PoseLocality
 from avatar.methods.pop import PopAvatar, PopConfig
 from avatar.methods.scale import PointNetConfig, PoseFeature, ScaleAvatar, ScaleConfig
 from avatar.nn.decoders import DecoderConfig
-from avatar.nn.encoders import Encoder
+from avatar.nn.encoders import Encoder, PointNet2Config
 from avatar.nn.hierarchy import HierarchyConfig
+from avatar.nn.layers import PointNorm
 from avatar.nn.locality import LocalPoseConfig
-from avatar.nn.pointnet2 import PointNet2Config, PointNorm
 from avatar.nn.unet import UNetConfig
 from avatar.records import Batch, SurfaceSamples
 

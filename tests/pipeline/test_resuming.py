@@ -29,7 +29,7 @@ from avatar.pipeline.scores import (
     predict,
 )
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 from avatar.settings import settings_from_dict
 from avatar.training.trainer import FORMAT
 from reliability.small_jobs import folder_of, train_job

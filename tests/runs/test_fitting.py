@@ -20,10 +20,8 @@ from avatar.methods.base import TrainedAvatar
 from avatar.methods.closet import Closet, ClosetAvatar, Skinning
 from avatar.methods.losses import LossConfig, point_avatar_loss
 from avatar.methods.points import body_batch, predict, template_samples
-from avatar.methods.settings import MethodChoice, RunConfig
-from avatar.runs.fitting import FitConfig, fit_outfit
-from avatar.runs.loading import load_avatar
-from avatar.runs.training import WEIGHTS
+from avatar.methods.settings import FitConfig, MethodChoice, RunConfig
+from avatar.runs.training import WEIGHTS, fit_outfit, load_avatar
 from avatar.runs.training import train as train_run
 
 

@@ -20,9 +20,8 @@ from avatar.methods.closet import ClosetConfig
 from avatar.methods.points import body_batch, predict, template_samples
 from avatar.methods.registry import find_method
 from avatar.methods.settings import MethodChoice, Precision, RunConfig
-from avatar.runs.loading import choose_weights, load_avatar
 from avatar.runs.prediction import predict_frames, predict_motion
-from avatar.runs.training import mean_template
+from avatar.runs.training import choose_weights, load_avatar, mean_template
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_from_dict
 from avatar.simulate.sequences import authored_motion

@@ -18,8 +18,7 @@ from avatar.methods.points import PointTask
 from avatar.methods.pop import PopAvatar, PopConfig
 from avatar.methods.settings import TrainConfig
 from avatar.nn.decoders import DecoderConfig
-from avatar.nn.pointnet2 import PointNorm
-from avatar.nn.shared_norm import synchronize_norms
+from avatar.nn.layers import PointNorm, synchronize_norms
 from avatar.nn.unet import UNetConfig
 from avatar.records import Batch, Template
 from avatar.training.trainer import Trainer

@@ -15,7 +15,7 @@ from avatar.checks import AvatarError
 from avatar.io.checkpoints import load_checkpoint
 from avatar.methods.canonicalizer import CanonicalizeConfig
 from avatar.methods.settings import MethodChoice, RunConfig
-from avatar.nn.shared_norm import synchronize_norms
+from avatar.nn.layers import synchronize_norms
 from avatar.runs.canonicalizing import train_canonicalizer
 from avatar.runs.training import train as train_run
 from avatar.training.logs import read_log

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from avatar.methods.closet import ClosetConfig
+from avatar.nn.encoders import FeaturePropagation, PointNet2, SetAbstraction
 from avatar.nn.hierarchy import Level
-from avatar.nn.pointnet2 import FeaturePropagation, PointNet2, SetAbstraction
 from avatar.settings import settings_from_dict
 from benchmarks.avatars import sample_batch
 from benchmarks.comparisons import Comparison, Job, Run

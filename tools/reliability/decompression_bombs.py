@@ -28,7 +28,7 @@ from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_motion
 from avatar.io.npz import write_whole
 from avatar.io.points import read_points
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 from reliability.findings import Finding, all_of
 from reliability.formats import BVH, smpl_arrays
 from reliability.small_jobs import DECODER, folder_of, prepare, train_job

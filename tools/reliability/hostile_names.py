@@ -19,11 +19,10 @@ from avatar.data.layouts import find_outfit
 from avatar.io.checkpoints import load_checkpoint
 from avatar.io.frames import check_manifest
 from avatar.io.ledger import digest_of
-from avatar.methods.settings import RunConfig
+from avatar.methods.settings import FitConfig, RunConfig
 from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.scores import PredictConfig, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
-from avatar.runs.fitting import FitConfig
 from avatar.runs.training import save_settings
 from avatar.settings import settings_from_dict, settings_to_dict
 from reliability.findings import Finding, none_of

@@ -25,7 +25,7 @@ from avatar.data.layouts import open_outfit_folder
 from avatar.io.checkpoints import load_checkpoint, read_weights
 from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_motion
-from avatar.runs.loading import load_avatar
+from avatar.runs.training import load_avatar
 from reliability.findings import Finding, all_of, none_of
 from reliability.formats import FORMATS, smpl_arrays
 from reliability.workers import run_worker

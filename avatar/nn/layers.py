@@ -1,17 +1,58 @@
-"""Batch normalisation over the batches of all ranks, on CUDA and on the CPU."""
+"""Layers over points, layers in float32 whatever a network runs in, and normalisation over all ranks."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection
 from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.nn.functional import linear
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from avatar.checks import AvatarError
-from avatar.nn.pointnet2 import PointNorm
+from avatar.geometry.precision import full_precision
+
+wide_linear = full_precision(linear)
+
+
+class WideLinear(nn.Linear):
+    """A linear layer in full precision: ``(..., C)`` to ``(..., C')``."""
+
+    @full_precision
+    def forward(self, features: Tensor) -> Tensor:
+        return super().forward(features)
+
+
+class WideConv2d(nn.Conv2d):
+    """A convolution in full precision: ``(B, C, H, W)`` to ``(B, C', H', W')``."""
+
+    @full_precision
+    def forward(self, image: Tensor) -> Tensor:
+        return super().forward(image)
+
+
+class PointNorm(nn.BatchNorm1d):
+    """Batch normalisation over every dimension but the last: ``(..., C)`` to ``(..., C)``."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        return super().forward(features.flatten(0, -2)).view_as(features)
+
+
+def point_mlp(
+    widths: tuple[int, ...], first: type[nn.Linear] = nn.Linear, activation: type[nn.Module] = nn.ReLU
+) -> nn.Sequential:
+    """Linear, normalisation, activation for each consecutive pair of widths; acts on the last dimension.
+
+    ``first`` is the kind of the first layer: `WideLinear` where it sees positions.
+    """
+    layers: list[nn.Module] = []
+    for fan_in, fan_out in itertools.pairwise(widths):
+        kind = nn.Linear if layers else first
+        layers += [kind(fan_in, fan_out), PointNorm(fan_out), activation()]
+    return nn.Sequential(*layers)
 
 
 class _GatherMoments(torch.autograd.Function):
@@ -40,7 +81,7 @@ class SharedNorm(_BatchNorm):
     dimension = -1  # of the channels
 
     def _check_input_dim(self, features: Tensor) -> None:
-        """Any shape with channels in `dimension` will do."""
+        """Accepts any shape with channels in `dimension`."""
 
     def forward(self, features: Tensor) -> Tensor:
         """Normalises ``(..., C, ...)`` features; in evaluation by the running statistics."""
@@ -74,10 +115,8 @@ def synchronize_norms(model: nn.Module, replicated: Collection[str] = ()) -> Non
     """Turns the batch normalisations of a model into `SharedNorm`s, in place; names and weights stay the same.
 
     Those of the ``replicated`` submodules stay as they are: every process runs them on all outfits of the step
-    (`step_outfits`), so each has the whole batch's statistics by itself.
-
-    Raises:
-        AvatarError: for a kind of normalisation whose statistics it would not know how to synchronise.
+    (`step_outfits`), so each has the whole batch's statistics by itself. Raises `AvatarError` for a kind of
+    normalisation whose statistics it would not know how to synchronise.
     """
     for path, parent in list(model.named_modules()):
         if path.partition(".")[0] in replicated:
