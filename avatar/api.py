@@ -180,11 +180,13 @@ def score(
     """Metrics of one predicted surface against a true one, by name, in their units (`evaluation.metrics.METRICS`).
 
     Raises:
-        AvatarError: for an unknown metric, one that needs a body or a sequence, or points that are not finite.
+        AvatarError: for an unknown metric, one that needs a body, a sequence or a mesh that is not there, or points
+            that are not finite.
     """
     cloud, mesh = (prediction.cloud, prediction.mesh) if isinstance(prediction, Surface) else (prediction, None)
     found = find_metrics(tuple(metrics))
-    if wrong := [metric.name for metric in found if metric.needs_body or metric.sequential]:
+    lacking = [m.needs_body or m.sequential or (m.needs_mesh and mesh is None) for m in found]
+    if wrong := [metric.name for metric, lacks in zip(found, lacking) if lacks]:
         raise AvatarError(f"metrics: expected those of two surfaces, got {', '.join(wrong)}.")
     comparison = Comparison(cloud, Scan(truth.points, truth.normals), mesh=mesh)
     return {metric.name: float(metric.measure(comparison)) for metric in found}

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.evaluation.closest import closest_on_mesh
+from avatar.evaluation.crossings import crossing_faces
+from avatar.evaluation.views import normal_map_error, render_normals, silhouette_overlap, view_frame
 from avatar.geometry.distances import normal_difference, point_to_plane, point_to_point
 from avatar.geometry.neighbours import k_nearest, nearest
 from avatar.geometry.surface import vertex_normals
@@ -23,6 +25,7 @@ EXACT_WITHIN = 0.01  # metres; beyond, depths on a body may be off by a millimet
 SKIN_TOLERANCE = 1e-3  # metres a point may lie under the bare body: uncovered skin is the body itself
 SPREAD_NEIGHBOURS = 5
 DISC_NEIGHBOURS = 8
+HOLE = 0.01  # metres of the true surface to the predicted one from which on it counts as a hole
 
 
 class Comparison:
@@ -52,6 +55,25 @@ class Comparison:
     def point_of_scan(self) -> Tensor:
         """Index of the nearest predicted point to each scan point, ``(M,)``."""
         return nearest(self.scan[None], self.points[None])[0]
+
+    @cached_property
+    def spacing(self) -> float:
+        """Typical mean distance of a scan point to its `DISC_NEIGHBOURS` nearest ones, metres."""
+        return float(neighbour_distances(self.scan, DISC_NEIGHBOURS).mean(dim=-1).quantile(0.5))
+
+    @property
+    def even_spacing(self) -> float:
+        """What `spacing` would be of as many points as predicted, spread evenly over the scan's surface, metres."""
+        return self.spacing * (len(self.scan) / len(self.points)) ** 0.5
+
+    @cached_property
+    def normal_maps(self) -> tuple[Tensor, Tensor]:
+        """Rendered normals of prediction and scan, discs as large as evenly spread points need (`render_normals`)."""
+        place = view_frame(self.scan)
+        return (
+            render_normals(self.points, self.normals, self.even_spacing, *place),
+            render_normals(self.scan, self.scan_normals, self.spacing, *place),
+        )
 
     @cached_property
     def depths(self) -> Tensor:
@@ -103,6 +125,7 @@ AREA = Unit("m^2", 1e4, "1e-4 m²")
 TENTHS = Unit("1", 10, "1e-1")
 CENTIMETRES = Unit("cm", 1, "cm")
 MILLIMETRES = Unit("m", 1e3, "mm")
+DEGREES = Unit("degree", 1, "°")
 PERCENT = Unit("1", 100, "%")
 RATIO = Unit("1", 1, "1")
 ACCELERATION = Unit("m/frame^2", 1e3, "mm/frame²")
@@ -124,6 +147,7 @@ class Metric:
     higher_is_better: bool = False
     sequential: bool = False
     needs_body: bool = False
+    needs_mesh: bool = False
 
     @property
     def heading(self) -> str:
@@ -133,7 +157,8 @@ class Metric:
 
 METRIC_NAMES = (  # one literal, for settings are read without running the functions below (`avatar.declared`)
     *("cd_point", "cd_pop", "normal_l1", "normal_l1_mean", "s2m_cm", "normal_consistency", "f_score_5mm"),
-    *("f_score_1cm", "penetration_share", "penetration_depth", "uniformity", "jitter"),
+    *("f_score_1cm", "cd_even", "normal_map", "silhouette", "holes", "penetration_share", "penetration_depth"),
+    *("self_intersection", "uniformity", "jitter"),
 )
 METRICS: dict[str, Metric] = {}
 
@@ -206,11 +231,11 @@ def scan_to_surface(c: Comparison) -> Tensor:
         hits = closest_on_mesh(c.scan.numpy(), c.mesh.vertices, c.mesh.faces)
         return 100 * torch.from_numpy(np.abs(hits.signed_distances)).mean()
     radius = float(neighbour_distances(c.points, DISC_NEIGHBOURS).mean(dim=-1).quantile(0.5))
-    return 100 * scan_to_discs(c.scan, c.points, c.normals, c.point_of_scan, radius)
+    return 100 * scan_to_discs(c.scan, c.points, c.normals, c.point_of_scan, radius).mean()
 
 
 def scan_to_discs(scan: Tensor, points: Tensor, normals: Tensor, point_of_scan: Tensor, radius: float) -> Tensor:
-    """Mean distance from scan points to the disc at their nearest predicted point. Metres.
+    """Distances from scan points to the disc at their nearest predicted point, ``(M,)`` metres.
 
     A point cloud's surface for D_s2m: exact planes would hide holes (a plane runs on over them), bare points would
     count their own spacing as error.
@@ -218,7 +243,7 @@ def scan_to_discs(scan: Tensor, points: Tensor, normals: Tensor, point_of_scan: 
     away = scan - points[point_of_scan]
     height = (away * normals[point_of_scan]).sum(dim=-1)
     aside = (away.square().sum(dim=-1) - height.square()).clamp(min=0).sqrt()
-    return torch.hypot(height, (aside - radius).clamp(min=0)).mean()
+    return torch.hypot(height, (aside - radius).clamp(min=0))
 
 
 @metric("normal_consistency", TENTHS)
@@ -264,6 +289,38 @@ def f_score(to_scan: Tensor, to_points: Tensor, threshold: float) -> Tensor:
     return 2 * precision * recall / (precision + recall).clamp(min=1e-12)
 
 
+@metric("cd_even", AREA)
+def even_chamfer(c: Comparison) -> Tensor:
+    """cd_point after even resampling: predicted points count by the area they stand for, the square of their mean
+    distance to 5 nearest neighbours, so that clumps do not outvote the surface between them.
+    """
+    areas = neighbour_distances(c.points, SPREAD_NEIGHBOURS).mean(dim=-1).square()
+    to_scan = point_to_point(c.points[None], c.scan[None, c.scan_of_point])[0]
+    return (areas * to_scan).sum() / areas.sum().clamp(min=1e-30) + _scan_to_points(c)
+
+
+@metric("normal_map", DEGREES)
+def normal_maps_apart(c: Comparison) -> Tensor:
+    """Mean angle between rendered normal maps of prediction and scan where both are seen, six views 60° apart from 20°
+    above the horizon, 192 x 192 pixels; points are discs as wide as evenly spread ones need to close.
+    """
+    return normal_map_error(*c.normal_maps)
+
+
+@metric("silhouette", PERCENT, higher_is_better=True)
+def silhouettes_shared(c: Comparison) -> Tensor:
+    """Silhouette overlap in the views of normal_map: intersection over union, all views together. Higher is better."""
+    return silhouette_overlap(*c.normal_maps)
+
+
+@metric("holes", PERCENT)
+def holes(c: Comparison) -> Tensor:
+    """Share of scan points more than 1 cm from the predicted surface: from the disc at the nearest predicted point, as
+    wide as evenly spread points need to close.
+    """
+    return (scan_to_discs(c.scan, c.points, c.normals, c.point_of_scan, c.even_spacing) > HOLE).double().mean()
+
+
 @metric("penetration_share", PERCENT, needs_body=True)
 def penetration_share(c: Comparison) -> Tensor:
     """Share of predicted points more than 1 mm under the posed bare body's surface (at most 5,000 points a frame are
@@ -277,6 +334,12 @@ def penetration_depth(c: Comparison) -> Tensor:
     """Mean depth under the bare body's surface of the points that penetration_share counts, 0 if none."""
     inside = c.depths[c.depths > SKIN_TOLERANCE]
     return inside.mean() if len(inside) else c.depths.new_zeros(())
+
+
+@metric("self_intersection", PERCENT, needs_mesh=True)
+def self_intersection(c: Comparison) -> Tensor:
+    """Share of the predicted mesh's faces that cross another face with which they share no vertex; meshes only."""
+    return torch.from_numpy(crossing_faces(c.mesh.vertices, c.mesh.faces)).double().mean()
 
 
 @metric("uniformity", RATIO)

@@ -167,7 +167,7 @@ def score_predictions(
         return [file_digest(files[name]) for files in (clouds, surfaces) if files]
 
     memory = remember_scores(ledger, "predictions", outfit, split, config, predicted=made_of)
-    return score_frames(outfit, split, names, config, label, compare, memory)
+    return score_frames(outfit, split, names, config, label, compare, memory, bool(surfaces))
 
 
 def posed_body(outfit: Outfit, frame: Frame) -> Mesh | None:
@@ -238,14 +238,17 @@ def score_frames(
     label: Label,
     compare: Callable[[Frame], Comparison],
     memory: Memory,
+    meshes: bool = False,
 ) -> Scores:
     """Every metric of every frame, and their means.
 
-    ``compare`` makes the `Comparison` of a frame. Errors it or a metric raises are passed on with the frame's name.
-    Values that ``memory`` knows are not measured again.
+    Metrics of meshes are measured where ``meshes`` says that every frame has one. ``compare`` makes the `Comparison` of
+    a frame. Errors it or a metric raises are passed on with the frame's name. Values that ``memory`` knows are not
+    measured again.
     """
-    metrics = [m for m in find_metrics(config.metrics) if not m.needs_body or getattr(outfit, "template", None)]
-    if len(metrics) < len(config.metrics):
+    metrics = [m for m in find_metrics(config.metrics) if meshes or not m.needs_mesh]
+    if not getattr(outfit, "template", None) and any(m.needs_body for m in metrics):
+        metrics = [m for m in metrics if not m.needs_body]
         log.warning("%s: no template, so penetration into the body is not scored.", outfit.name)
     frames: list[FrameScore] = []
     counts, window = [], []
