@@ -67,7 +67,8 @@ class PointTask(Task):
         """Prepares training of a network that is called as ``model(batch, samples) -> Prediction``.
 
         Its garment codes, if any, are in ``codes``. ``batch_at`` gives this rank's shard of a step's batch, which
-        follows from the step alone; ``frames`` is the number of training frames; ``validation`` gives the held-back batches of all ranks.
+        follows from the step alone; ``frames`` is the number of training frames; ``validation`` gives the held-back
+        batches of all ranks.
         """
         self.model, self.template, self.config = model, template, config
         self.batch_at, self.validation, self.frames, self.batch = batch_at, validation, frames, config.batch
