@@ -142,7 +142,7 @@ class TemplateNetwork(nn.Module):
             parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1), places))
         start, scale = self.bare_body(samples), self.config.offset_scale
         scaled = [part.scaled(scale) for part in parts]
-        local = sum(scaled, start) if self.scale_first else sum(parts, start).scaled(scale)
+        local = sum(scaled, start.scaled(scale)) if self.scale_first else sum(parts, start).scaled(scale)
         both = len(parts) == 2  # alone they are the whole, not a part of it
         return replace(
             self.pose_points(local, batch, samples),
