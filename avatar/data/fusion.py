@@ -14,7 +14,6 @@ import torch
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from avatar.data.patterns import paint
 from avatar.data.scanner import (
     DressedSurface,
     ScanConfig,
@@ -22,6 +21,7 @@ from avatar.data.scanner import (
     frame_seed,
     keep_points,
     outside_holes,
+    paint,
     scan_mesh,
 )
 from avatar.geometry.surface import vertex_normals

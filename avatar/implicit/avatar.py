@@ -15,11 +15,8 @@ from avatar.geometry.chunks import in_chunks
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import transform_points
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
-from avatar.implicit.gating import Attention, PoseGate, joint_quaternions
-from avatar.implicit.lattice import FieldLattice
-from avatar.implicit.networks import MlpConfig
-from avatar.implicit.sdf import PosedSdf, SdfConfig
-from avatar.implicit.texture import TextureField
+from avatar.implicit.fields import Attention, FieldLattice, PoseGate, joint_quaternions
+from avatar.implicit.networks import MlpConfig, PosedSdf, SdfConfig, TextureField
 from avatar.records import Mesh, PointCloud, Template
 
 CHUNK = 65_536  # points skinned or coloured at once

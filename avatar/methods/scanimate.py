@@ -13,17 +13,24 @@ from torch import Tensor, nn
 
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
 from avatar.checks import AvatarError, DataError
-from avatar.data.canonical_batches import CanonicalBatch, CanonicalFrame, CanonicalFrames, canonical_frame
+from avatar.data.batches import LruSequence
+from avatar.data.canonical_frames import CanonicalBatch, CanonicalFrame, CanonicalFrames, canonical_frame
 from avatar.data.mirroring import mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
-from avatar.data.streaming import LruSequence
 from avatar.environment import choose_device
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig, sample_mesh
-from avatar.implicit.body_field import BodyField
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
-from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
+from avatar.implicit.fields import BodyField
+from avatar.implicit.losses import (
+    TERMS,
+    ImplicitLossConfig,
+    ProbeConfig,
+    SpacePoints,
+    implicit_loss,
+    probe_field,
+    space_points,
+)
 from avatar.io.documents import read_yaml
 from avatar.methods.base import CANONICALIZER, SEED_STRIDE, Inputs, Method, Position, Stage, Task, TrainedAvatar
 from avatar.methods.canonicalizer import (

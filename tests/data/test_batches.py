@@ -7,8 +7,7 @@ from scipy.spatial import cKDTree
 from torch.utils.data import DataLoader
 
 from avatar.checks import AvatarError
-from avatar.data.batches import FrameDataset, collate, draw_points, name_frames
-from avatar.data.streaming import bytes_of
+from avatar.data.batches import FrameDataset, bytes_of, collate, draw_points, name_frames
 
 
 @pytest.fixture

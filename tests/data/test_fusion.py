@@ -8,8 +8,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from avatar.data.fusion import fuse_mesh, fused_noise, rim_partners, split_faces, split_long_edges, weld_contacts
-from avatar.data.patterns import Pattern
-from avatar.data.scanner import DressedSurface, ScanConfig, scan_mesh
+from avatar.data.scanner import DressedSurface, Pattern, ScanConfig, scan_mesh
 from avatar.records import Scan
 
 
@@ -172,7 +171,7 @@ def test_a_raw_mesh_is_fine_noisy_holed_and_repeatable():
 
 
 def test_an_outfit_is_scanned_as_a_mesh_where_asked(tiny_folder):
-    from avatar.data.open_layout import OpenOutfit
+    from avatar.data.layouts import OpenOutfit
 
     outfit = OpenOutfit(tiny_folder, "open", ScanConfig(mesh=True, merge=0.012, noise=0.001))
     scan = outfit.load("train", "rise.00003").scan

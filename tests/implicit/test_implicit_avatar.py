@@ -10,11 +10,10 @@ from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig, PoseInput, sample_mesh
-from avatar.implicit.body_field import BodyField
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.implicit.networks import MlpConfig
-from avatar.implicit.probing import SpacePoints, probe_field
-from avatar.implicit.sdf import SdfConfig
+from avatar.implicit.fields import BodyField
+from avatar.implicit.losses import SpacePoints, probe_field
+from avatar.implicit.networks import MlpConfig, SdfConfig
 from avatar.records import Mesh
 
 BODY = open_body("female")

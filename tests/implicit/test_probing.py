@@ -6,11 +6,16 @@ from spheres import sphere_template
 
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig
-from avatar.implicit.body_field import BodyField
-from avatar.implicit.losses import ImplicitLossConfig, implicit_loss
-from avatar.implicit.networks import MlpConfig
-from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
-from avatar.implicit.sdf import SdfConfig
+from avatar.implicit.fields import BodyField
+from avatar.implicit.losses import (
+    ImplicitLossConfig,
+    ProbeConfig,
+    SpacePoints,
+    implicit_loss,
+    probe_field,
+    space_points,
+)
+from avatar.implicit.networks import MlpConfig, SdfConfig
 
 TEMPLATE = sphere_template(2)  # a unit sphere skinned to one joint
 BOX = torch.tensor([[-1.5, -1.4, -1.3], [1.5, 1.4, 1.3]])

@@ -7,13 +7,12 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from avatar.canonical.baselines import NearestBody
-from avatar.canonical.scans import canonicalize_scan
+from avatar.canonical.scans import NearestBody, canonicalize_scan
 from avatar.checks import AvatarError, DataError
-from avatar.data.canonical_batches import CanonicalFrames, canonical_frame
+from avatar.data.canonical_frames import CanonicalFrames, canonical_frame
 from avatar.data.splits import SplitConfig
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.implicit.probing import ProbeConfig
+from avatar.implicit.losses import ProbeConfig
 from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.checkpoints import load_checkpoint
 from avatar.io.meshes import read_mesh
