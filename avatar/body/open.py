@@ -54,9 +54,7 @@ def open_body_shapes() -> tuple[str, ...]:
 def open_body(shape: str = "female", canonical_pose: Tensor | None = None) -> BodyModel:
     """The open body in one of its shapes, or in their ``mean``; 22 SMPL-order joints, zero pose is the T-pose.
 
-    Raises:
-        AvatarError: for an unknown shape, naming those there are.
-        DataError: when the asset is missing or damaged.
+    Raises `AvatarError` for an unknown shape, naming those there are; `DataError` when the asset is missing or damaged.
     """
     names = open_body_shapes()
     if shape not in (*names, MEAN_SHAPE):

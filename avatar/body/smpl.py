@@ -84,9 +84,8 @@ def smpl_body(
         canonical_pose: ``(J, 3)`` axis-angle pose of the canonical space; the T-pose if None.
         kind: what the file must hold (smpl, smplh, smplx); any if None.
 
-    Raises:
-        DataError: for a missing or damaged file or one of another kind, with the way to a good one.
-        AvatarError: for more betas than the file has.
+    Raises `DataError` for a missing or damaged file or one of another kind, with the way to a good one; `AvatarError`
+    for more betas than the file has.
     """
     model = _read_model(path, kind)
     components = model["shapedirs"].shape[-1]
@@ -135,8 +134,7 @@ def way_to_file(kind: str, path: Path | None = None) -> str:
 def converted_kind(path: Path) -> str:
     """The kind of model a converted file holds: smpl, smplh or smplx.
 
-    Raises:
-        DataError: for a missing or damaged file, or one that tools/convert_body.py has not written.
+    Raises `DataError` for a missing or damaged file, or one that tools/convert_body.py has not written.
     """
     try:
         return str(read_arrays(path, {"kind": "text 1"})["kind"][0])
@@ -182,7 +180,7 @@ SOURCE_KEYS = {
     "f": "int F 3",
     "kintree_table": "int 2 J",
 }
-OPTIONAL_SOURCE_KEYS = {"posedirs": "number V 3 P", "vt": "number U 2", "ft": "number F 3"}  # vt and ft are SMPL-X's atlas
+OPTIONAL_SOURCE_KEYS = {"posedirs": "number V 3 P", "vt": "number U 2", "ft": "number F 3"}  # vt, ft: an atlas
 
 
 def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> str:
@@ -200,9 +198,8 @@ def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> st
     Returns:
         The kind of model it is: smpl, smplh, smplx or packed (a ``template.npz``).
 
-    Raises:
-        DataError: naming the file, for a damaged or hostile one, missing keys, or shapes that do not fit.
-        AvatarError: when the target is not an npz.
+    Raises `DataError` naming the file, for a damaged or hostile one, missing keys, or shapes that do not fit;
+    `AvatarError` when the target is not an npz.
     """
     source, target = Path(source), Path(target)
     if target.suffix != ".npz":

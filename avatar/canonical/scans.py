@@ -66,8 +66,7 @@ def canonicalize_scan(
         template: the body at rest in its canonical pose.
         stretch: see above; infinity keeps everything.
 
-    Raises:
-        AvatarError: for weights that do not fit, or when nothing is left of the scan.
+    Raises `AvatarError` for weights that do not fit, or when nothing is left of the scan.
     """
     check_shape("weights", weights, "M J", M=len(scan.points), J=len(template.parents))
     check_finite("weights", weights)

@@ -110,8 +110,7 @@ class FrameDataset(Dataset):
             seed: of the order and of the subsets.
             cache_bytes: memory that frames may be kept in; the least recently used leave first.
 
-        Raises:
-            AvatarError: without frames, or for outfits whose bodies are not of one topology.
+        Raises `AvatarError` without frames, or for outfits whose bodies are not of one topology.
         """
         if not names or points < 1:
             raise AvatarError(f"names, points: expected at least 1 each, got {len(names)} and {points}.")

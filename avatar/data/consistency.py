@@ -21,10 +21,8 @@ def check_joints(template: Template, path: Path) -> None:
     """Refuses joints that do not lie where the skinning weights of their subtree end.
 
     A joint turns its subtree about itself, so it lies near the border at which the subtree's weights fade
-    (`joint_positions`). Joints without such a border are not judged.
-
-    Raises:
-        DataError: with the largest gap and the likely cause.
+    (`joint_positions`). Joints without such a border are not judged. Raises `DataError` with the largest gap and the
+    likely cause.
     """
     vertices, weights = template.vertices.numpy(), template.weights.numpy()
     borders = border_positions(vertices, weights, template.parents)
@@ -59,8 +57,7 @@ def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Te
         template: the body at rest.
         path: the frame's file.
 
-    Raises:
-        DataError: with the distance between the two and the likely cause.
+    Raises `DataError` with the distance between the two and the likely cause.
     """
     apart = _apart(posed, vertices)
     if apart <= APART:
@@ -93,8 +90,7 @@ def check_carried(transforms: np.ndarray, template: Template, vertices: np.ndarr
         vertices: ``(V, 3)`` the frame's body.
         path: the frame's file.
 
-    Raises:
-        DataError: with the mean error in lengths of the edges and the likely cause.
+    Raises `DataError` with the mean error in lengths of the edges and the likely cause.
     """
     linear = transforms[:, :3, :3].astype(np.float64)
     starts, ends = template.faces[:, :2].flatten().numpy(), template.faces[:, 1:].flatten().numpy()

@@ -51,8 +51,7 @@ def fuse_mesh(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan:
         config: longest edge, merging, noise, holes, pattern, seed; ``points`` does not matter.
         frame: the frame's name, part of the random seed.
 
-    Raises:
-        AvatarError: when nothing can be seen, or holes have taken every point.
+    Raises `AvatarError` when nothing can be seen, or holes have taken every point.
     """
     rng = np.random.default_rng(frame_seed(config.seed, frame))
     scan = split_long_edges(scan_mesh(surface), config.edge)

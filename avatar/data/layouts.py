@@ -38,8 +38,7 @@ class OpenBody:
     def from_settings(cls, settings: dict[str, Any], path: Path) -> OpenBody:
         """Reads ``body: {model: open, shape: female, canonical: t}`` or ``{model: packed, canonical: t}``.
 
-        Raises:
-            DataError: where it says otherwise.
+        Raises `DataError` where it says otherwise.
         """
         body = settings.get("body", {})
         body = body if isinstance(body, dict) else {}
@@ -166,9 +165,8 @@ def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | Non
         outfit: the outfit's folder name.
         scanner: how simulated frames are scanned; a perfect scanner if None. Real scans are as they are.
 
-    Raises:
-        AvatarError: for names that could leave the data root.
-        DataError: naming the outfits there are, or what is wrong with this one.
+    Raises `AvatarError` for names that could leave the data root; `DataError` naming the outfits there are, or what is
+    wrong with this one.
     """
     return open_outfit_folder(outfit_folder(root, dataset, outfit), dataset, scanner)
 
@@ -176,8 +174,7 @@ def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | Non
 def open_outfit_folder(path: Path, dataset: str = "", scanner: ScanConfig | None = None) -> Outfit:
     """An outfit by its folder; the layout is what ``outfit.yaml`` says, or what its files show.
 
-    Raises:
-        DataError: for an unknown layout, naming those there are.
+    Raises `DataError` for an unknown layout, naming those there are.
     """
     path = Path(path)
     shown = "open" if (path / "garment.npz").is_file() else "packed"

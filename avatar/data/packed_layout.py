@@ -271,10 +271,8 @@ def _through(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None)
 def _stored_pose(pose: np.ndarray, joint_names: Sequence[str], path: Path) -> np.ndarray:
     """A file's pose as axis-angle of the body's joints ``(J, 3)``.
 
-    Joints of hands and face may be missing from the pose, or from the body: they are at rest then.
-
-    Raises:
-        DataError: for another shape, or rotations of joints that the body lacks.
+    Joints of hands and face may be missing from the pose, or from the body: they are at rest then. Raises `DataError`
+    for another shape, or rotations of joints that the body lacks.
     """
     rows, joints, shared = len(pose) if pose.shape[1:] == (3,) else 0, len(joint_names), len(SMPL_JOINTS)
     if list(joint_names[:shared]) == SMPL_JOINTS and shared <= rows != joints:
@@ -335,8 +333,7 @@ def write_packed_frame(path: Path, frame: Frame) -> None:
 def write_packed_outfit(outfit: Outfit, folder: Path) -> PackedOutfit:
     """Writes all frames of an outfit, of whatever layout, as a packed outfit with template and manifest.
 
-    Raises:
-        DataError: for a frame that is not sound.
+    Raises `DataError` for a frame that is not sound.
     """
     folder = Path(folder)
     settings = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{outfit.dataset}/{outfit.name}"}

@@ -41,8 +41,7 @@ class Pattern(Enum):
 def paint(scan: Scan, pattern: Pattern) -> Scan:
     """The scan with colours; as it is for `Pattern.none`.
 
-    Raises:
-        AvatarError: for a scan without labels and canonical positions, which only simulated data has.
+    Raises `AvatarError` for a scan without labels and canonical positions, which only simulated data has.
     """
     if pattern is Pattern.none:
         return scan
@@ -163,8 +162,7 @@ def scan_points(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan
         config: number of points, noise, holes, merging, pattern, seed.
         frame: the frame's name, part of the random seed.
 
-    Raises:
-        AvatarError: when nothing can be seen, or holes have taken every point.
+    Raises `AvatarError` when nothing can be seen, or holes have taken every point.
     """
     faces = surface.faces[surface.visible]
     if len(faces) == 0:

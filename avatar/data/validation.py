@@ -144,8 +144,7 @@ TURNS = {  # where it should lie and where it does: what corrects it
 def check_template(template: Template, path: Path) -> None:
     """Refuses a body at rest that does not stand upright in metres, y up, facing +z.
 
-    Raises:
-        DataError: with the turn, or the factor, that would correct it.
+    Raises `DataError` with the turn, or the factor, that would correct it.
     """
     vertices = template.vertices.numpy()
     extents = np.ptp(vertices, axis=0)
@@ -160,8 +159,7 @@ def check_template(template: Template, path: Path) -> None:
 def check_frame(frame: Frame, template: Template, path: Path) -> None:
     """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out.
 
-    Raises:
-        DataError: naming the file, what was expected and how to correct it.
+    Raises `DataError` naming the file, what was expected and how to correct it.
     """
     points, body = frame.scan.points, frame.body.vertices
     if len(points) < FEWEST_POINTS:
@@ -199,8 +197,7 @@ def check_pose(pose: np.ndarray, joints: int) -> None:
         pose: what came.
         joints: J, of the body.
 
-    Raises:
-        AvatarError: with what it looks like and how to write it as expected.
+    Raises `AvatarError` with what it looks like and how to write it as expected.
     """
     shape = tuple(np.shape(pose))
     if shape != (joints, 3):
@@ -218,8 +215,7 @@ def check_pose(pose: np.ndarray, joints: int) -> None:
 def check_frame_count(names: Sequence[str], path: Path, what: str, least: int = 2) -> None:
     """Refuses fewer frames than something can be learned from.
 
-    Raises:
-        DataError: naming what needs more, and the frames there are.
+    Raises `DataError` naming what needs more, and the frames there are.
     """
     if len(set(names)) < least:
         there = f"{len(set(names))} ({', '.join(sorted(set(names)))})" if names else "none"

@@ -100,8 +100,7 @@ class ImplicitAvatar(nn.Module):
     def colors(self, points: Tensor, joint_transforms: Tensor) -> Tensor:
         """Colours ``(B, N, 3)`` in [0, 1] at canonical points; what geometry gives to them is not trained by them.
 
-        Raises:
-            AvatarError: for an avatar without texture.
+        Raises `AvatarError` for an avatar without texture.
         """
         if self.texture is None:
             raise AvatarError("colors: this avatar was trained without texture (method.settings.avatar.colored=true).")

@@ -64,8 +64,7 @@ def extract_surface(
         box: ``(2, 3)`` lowest and highest corner of the space to look in.
         config: resolution and what is kept.
 
-    Raises:
-        AvatarError: when the field has no zero in the box, or is not finite.
+    Raises `AvatarError` when the field has no zero in the box, or is not finite.
     """
     check_shape("box", box, "2 3")
     config = config or ExtractionConfig()
