@@ -72,8 +72,8 @@ def quad_corners(triangles: np.ndarray, quads: np.ndarray, quad_uv: np.ndarray) 
 def patches_without_uv(faces: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> list[np.ndarray]:
     """Masks ``(F,)`` of the connected patches of triangles that have no UV coordinates, by rising x."""
     bare = corners[:, 0] < 0
-    rim, count = faces[bare], len(vertices)
-    links = coo_matrix((np.ones(rim.size), (rim.ravel(), np.roll(rim, -1, axis=1).ravel())), (count, count))
+    patch, count = faces[bare], len(vertices)
+    links = coo_matrix((np.ones(patch.size), (patch.ravel(), np.roll(patch, -1, axis=1).ravel())), (count, count))
     labels = connected_components(links, directed=False)[1][faces[:, 0]]
     masks = [bare & (labels == label) for label in np.unique(labels[bare])]
     return sorted(masks, key=lambda mask: vertices[faces[mask], 0].mean())

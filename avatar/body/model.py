@@ -131,7 +131,7 @@ class BodyModel(nn.Module):
     def forward(self, pose: Tensor, translation: Tensor | None = None) -> PosedBody:
         """Poses the body.
 
-        A vertex transform carries the canonical vertex to its posed place, pose blendshapes included: what they
+        A vertex transform poses the canonical vertex, pose blendshapes included: what they
         add since the canonical pose lies in its translation.
 
         Args:

@@ -107,7 +107,7 @@ def read_template(path: Path) -> Template:
     try:
         template = _template(arrays, arrays["vertices"], arrays.get("joints"))
         if "canonical_from_bind" in arrays:
-            template = replace(template, canonical_from_bind=_float32(arrays["canonical_from_bind"]))
+            template = replace(template, canonical_from_bind=float32_tensor(arrays["canonical_from_bind"]))
         check_bind(template)
     except AvatarError as error:
         raise DataError(path, str(error)) from error
@@ -139,22 +139,22 @@ def packed_body(path: Path) -> BodyModel:
     """
     arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
     bound = [key for key in BIND_KEYS if key in arrays]
-    directions = _float32(arrays.get("pose_directions"))
+    directions = float32_tensor(arrays.get("pose_directions"))
     try:
         if not bound:
             at_rest = _template(arrays, arrays["vertices"], arrays.get("joints"))
-            zero_from_bind = _float32(arrays.get("canonical_from_bind"))
+            zero_from_bind = float32_tensor(arrays.get("canonical_from_bind"))
             return BodyModel(_bind_of(at_rest, zero_from_bind), zero_from_bind, pose_directions=directions)
         if len(bound) < len(BIND_KEYS):
             raise AvatarError(f"bind pose: expected all of {', '.join(BIND_KEYS)} or none, got {', '.join(bound)}.")
         bind = _template(arrays, arrays["bind_vertices"], arrays["bind_joints"])
-        return BodyModel(bind, _float32(arrays["zero_from_bind"]), pose_directions=directions)
+        return BodyModel(bind, float32_tensor(arrays["zero_from_bind"]), pose_directions=directions)
     except (AvatarError, torch.linalg.LinAlgError) as error:  # transforms that cannot be inverted
         raise DataError(path, str(error)) from error
 
 
 def holds_template(path: Path) -> bool:
-    """Whether a file looks like a ``template.npz``, sound or not."""
+    """Whether a file looks like a ``template.npz``, valid or not."""
     try:
         with zipfile.ZipFile(path) as archive:
             return {"vertices.npy", "parents.npy"} <= set(archive.namelist())
@@ -165,7 +165,7 @@ def holds_template(path: Path) -> bool:
 def add_atlas(source: Path, target: Path, uv: Path) -> None:
     """Copies a ``template.npz`` with the UV atlas that an OBJ file has for its mesh.
 
-    Raises `DataError` for a template or an OBJ that is not sound, or not of one mesh.
+    Raises `DataError` for an invalid template or OBJ, or two of different meshes.
     """
     packed_body(source)
     arrays = read_arrays(source, REQUIRED_KEYS, OPTIONAL_KEYS)
@@ -237,6 +237,6 @@ def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.nd
     )
 
 
-def _float32(array: np.ndarray | None) -> Tensor | None:
+def float32_tensor(array: np.ndarray | None) -> Tensor | None:
     """A float32 tensor of an array, or None."""
     return None if array is None else torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avatar.body.inert_pickle import read_pickled_arrays
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
-from avatar.body.packed import add_atlas, atlas_arrays, holds_template
+from avatar.body.packed import add_atlas, atlas_arrays, float32_tensor, holds_template
 from avatar.checks import AvatarError, DataError, check_finite, check_shape
 from avatar.geometry.uv import check_atlas
 from avatar.io.npz import read_arrays, write_arrays
@@ -101,16 +101,17 @@ def smpl_body(
         parents, names = parents[:count], names[:count]
         posedirs = None if posedirs is None else posedirs[..., : 9 * (count - 1)]
     bind = Template(
-        vertices=_float32(vertices),
-        faces=_int64(model["faces"]),
-        weights=_float32(weights / weights.sum(axis=1, keepdims=True)),
-        joints=_float32(joints),
+        vertices=float32_tensor(vertices),
+        faces=torch.from_numpy(model["faces"].astype(np.int64)),
+        weights=float32_tensor(weights / weights.sum(axis=1, keepdims=True)),
+        joints=float32_tensor(joints),
         parents=parents,
         joint_names=names,
-        **({"uv": _float32(model["uv"]), "uv_faces": _int64(model["uv_faces"])} if "uv" in model else {}),
+        uv=float32_tensor(model.get("uv")),
+        uv_faces=torch.from_numpy(model["uv_faces"].astype(np.int64)) if "uv" in model else None,
     )
     try:
-        return BodyModel(bind, None, canonical_pose, None if posedirs is None else _float32(posedirs))
+        return BodyModel(bind, None, canonical_pose, float32_tensor(posedirs))
     except AvatarError as error:
         raise DataError(path, str(error)) from error
 
@@ -159,16 +160,6 @@ def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
     if stored not in EXTRA_JOINTS or tuple(model["parents"]) != joint_tree(stored)[1]:
         raise DataError(path, f"expected the joints of smpl, smplh or smplx, got {stored} with others.", hint)
     return model
-
-
-def _int64(array: np.ndarray) -> Tensor:
-    """An int64 tensor of an array."""
-    return torch.from_numpy(array.astype(np.int64))
-
-
-def _float32(array: np.ndarray) -> Tensor:
-    """A float32 tensor of an array."""
-    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
 
 
 SHAPE_COMPONENTS = {20: 10, 400: 300}  # SMPL-X stores expression blendshapes behind those of shape

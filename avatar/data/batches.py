@@ -155,27 +155,9 @@ class FrameDataset(Dataset):
         where = self.names[index]
         return self.outfits[where.outfit].load(where.split, where.name)
 
-    def order(self, epoch: int) -> np.ndarray:
-        """The permutation in which an epoch goes through the frames, ``(len,)``."""
-        return np.random.default_rng(frame_seed(self.seed, f"order/{epoch}")).permutation(len(self))
-
     def batch_at(self, step: int, size: int) -> Batch:
         """The batch of a training step: epochs follow each other without a gap, so every batch is full."""
-        items = []
-        for place in range(step * size, (step + 1) * size):
-            epoch, offset = divmod(place, len(self))
-            items.append(self.item(epoch, int(self.order(epoch)[offset])))
-        return collate(items)
-
-    def epoch_length(self, size: int) -> int:
-        """Steps after which every frame has been seen once, for `batch_at`."""
-        return -(-len(self) // size)
-
-    def epoch_batches(self, epoch: int, size: int) -> Iterator[Batch]:
-        """All frames once in the order of an epoch; the last batch may be smaller."""
-        order = self.order(epoch).tolist()
-        for start in range(0, len(order), size):
-            yield collate([self.item(epoch, index) for index in order[start : start + size]])
+        return collate([self.item(epoch, index) for epoch, index in step_frames(self.seed, step, size, len(self))])
 
     def ordered_batches(self, size: int) -> Iterator[Batch]:
         """All frames once in the order of ``names``, always with the same scan points: for validation."""
@@ -186,6 +168,14 @@ class FrameDataset(Dataset):
 def name_frames(outfits: Sequence[Outfit], split: str, names: Sequence[Sequence[str]]) -> tuple[FrameName, ...]:
     """Frame names of several outfits, one list an outfit, as `FrameDataset` takes them."""
     return tuple(FrameName(i, split, name) for i, _ in enumerate(outfits) for name in names[i])
+
+
+def step_frames(seed: int, step: int, size: int, count: int) -> Iterator[tuple[int, int]]:
+    """Epoch and index of the frames of a training step; each epoch is a permutation of ``count`` frames."""
+    for place in range(step * size, (step + 1) * size):
+        epoch, offset = divmod(place, count)
+        order = np.random.default_rng(frame_seed(seed, f"order/{epoch}")).permutation(count)
+        yield epoch, int(order[offset])
 
 
 def draw_points(available: int, count: int, rng: np.random.Generator) -> np.ndarray:

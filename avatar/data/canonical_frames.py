@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from avatar.body.model import BodyModel
 from avatar.checks import AvatarError, DataError
-from avatar.data.batches import draw_points
+from avatar.data.batches import draw_points, step_frames
 from avatar.data.mirroring import ACROSS, MirrorMap, mirror_coins
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import frame_seed
@@ -145,12 +145,8 @@ class CanonicalFrames:
 
     def batch_at(self, step: int, size: int) -> CanonicalBatch:
         """The batch of a training step: epochs follow each other without a gap, so every batch is full."""
-        items = []
-        for place in range(step * size, (step + 1) * size):
-            epoch, offset = divmod(place, len(self))
-            order = np.random.default_rng(frame_seed(self.seed, f"order/{epoch}")).permutation(len(self))
-            items.append(self.item(int(order[offset]), str(epoch)))
-        batch = join_batches(items)
+        places = step_frames(self.seed, step, size, len(self))
+        batch = join_batches([self.item(index, str(epoch)) for epoch, index in places])
         return batch if self.symmetry is None else mirror(batch, mirror_coins(self.seed, step, size), self.symmetry)
 
     def ordered(self) -> list[CanonicalBatch]:

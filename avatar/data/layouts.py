@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,37 +23,20 @@ from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_
 from avatar.records import BodyFit, Frame, Scan, Template
 
 
-@dataclass(frozen=True)
-class OpenBody:
-    """The subject as ``outfit.yaml`` names it: a ``shape`` of the open body or a ``body.npz`` of the same topology
-    (``shape`` None), and the ``canonical`` pose ``t`` or ``apart``.
-    """
-
-    shape: str | None
-    canonical: str
-
-    @classmethod
-    def from_settings(cls, settings: dict[str, Any], path: Path) -> OpenBody:
-        """Reads ``body: {model: open, shape: female, canonical: t}`` or ``{model: packed, canonical: t}``.
-
-        Raises `DataError` where it says otherwise.
-        """
-        body = settings.get("body", {})
-        body = body if isinstance(body, dict) else {}
-        named = body.get("model") == "open" and isinstance(body.get("shape"), str)
-        if not named and body.get("model") != "packed":
-            expected = "{model: open, shape, canonical} or {model: packed, canonical} with a body.npz"
-            raise DataError(path / "outfit.yaml", f"body: expected {expected}, got {settings.get('body')}.")
-        return cls(body["shape"] if named else None, str(body.get("canonical", "t")))
-
-
 class OpenOutfit(SurfaceOutfit):
     """An outfit of the open dataset: ``outfit.yaml``, ``garment.npz`` and frames of cloth and visibility."""
 
     def __init__(self, path: Path, dataset: str = "", scanner: ScanConfig | None = None):
         super().__init__(path, dataset)
         self.scanner = scanner or ScanConfig()
-        self._described = OpenBody.from_settings(read_outfit_settings(self.path), self.path)
+        settings = read_outfit_settings(self.path)
+        body = settings.get("body") if isinstance(settings.get("body"), dict) else {}
+        named = body.get("model") == "open" and isinstance(body.get("shape"), str)
+        if not named and body.get("model") != "packed":
+            expected = "{model: open, shape, canonical} or {model: packed, canonical} with a body.npz"
+            raise DataError(self.path / "outfit.yaml", f"body: expected {expected}, got {settings.get('body')}.")
+        self._shape: str | None = body["shape"] if named else None  # of the open body; None: body.npz is the subject
+        self._canonical = str(body.get("canonical", "t"))
 
     @cached_property
     def garment(self) -> OpenGarment:
@@ -65,8 +46,8 @@ class OpenOutfit(SurfaceOutfit):
     @cached_property
     def body(self) -> BodyModel:
         """The subject."""
-        if self._described.shape is not None:
-            return self._make_body(self._described.shape)
+        if self._shape is not None:
+            return self._make_body(self._shape)
         path = self.path / "body.npz"
         body = packed_body(path)
         if not torch.equal(body.faces, self.mean_body.faces):
@@ -82,7 +63,7 @@ class OpenOutfit(SurfaceOutfit):
         """An open body in the outfit's canonical pose."""
         try:
             body = open_body(shape)
-            return body.with_canonical_pose(canonical_pose(self._described.canonical, body.joint_names))
+            return body.with_canonical_pose(canonical_pose(self._canonical, body.joint_names))
         except DataError:
             raise
         except AvatarError as error:
@@ -150,10 +131,7 @@ def _stack(parts: Sequence[np.ndarray]) -> Tensor:
     return torch.from_numpy(np.concatenate(parts))
 
 
-LAYOUTS = {
-    "open": OpenOutfit,
-    "packed": lambda path, dataset, scanner: PackedOutfit(path, dataset),
-}
+LAYOUTS = ("open", "packed")
 
 
 def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | None = None) -> Outfit:
@@ -181,4 +159,4 @@ def open_outfit_folder(path: Path, dataset: str = "", scanner: ScanConfig | None
     layout = read_outfit_settings(path).get("layout", shown)
     if layout not in LAYOUTS:
         raise DataError(path / "outfit.yaml", f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}.")
-    return LAYOUTS[layout](path, dataset, scanner)
+    return OpenOutfit(path, dataset, scanner) if layout == "open" else PackedOutfit(path, dataset)

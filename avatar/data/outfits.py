@@ -63,7 +63,9 @@ class Outfit(ABC):
             held = ", or validation where frames were held back from training" if split == VALIDATION else ""
             near = did_you_mean(split, (*SPLITS, VALIDATION))
             raise AvatarError(sentences(f"split: expected train or test{held}, got {split!r}.", near))
-        return self._listed[split] or self._refuse_empty(split)
+        if not self._listed[split]:
+            raise DataError(self.path / split, "expected frames (*.npz), found none.", "Make or download the data.")
+        return self._listed[split]
 
     def has_frames(self, split: str) -> bool:
         """Whether there are frames of a split: data may come without a test folder, or with an empty one."""
@@ -84,7 +86,7 @@ class Outfit(ABC):
         """One frame, checked: finite, in metres, scan over body.
 
         Raises `AvatarError` for a frame that is not in the split, naming near ones; `DataError` for a damaged or
-        unsound file.
+        invalid file.
         """
         path = self.frame_path(split, name)
         frame = self._read_frame(path, split, name)
@@ -165,10 +167,6 @@ class Outfit(ABC):
     def _known(self) -> dict[str, frozenset[str]]:
         """The same names for look-ups."""
         return {split: frozenset(names) for split, names in self._listed.items()}
-
-    def _refuse_empty(self, split: str) -> tuple[str, ...]:
-        """The error of a split without frames."""
-        raise DataError(self.path / split, "expected frames (*.npz), found none.", "Make or download the data.")
 
     @abstractmethod
     def _read_template(self) -> Template:

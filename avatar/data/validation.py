@@ -119,7 +119,7 @@ BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
 FEWEST_POINTS = 100
 FAR_OFF = 10.0  # metres between the middles of scan and body that only a translation in other units explains
-# A sound frame covers 94% and more of the body, long dresses and raw scans included, and buries nothing.
+# A valid frame covers 94% and more of the body, long dresses and raw scans included, and buries nothing.
 LEAST_COVERED, MOST_BURIED = 0.6, 0.05  # each alone is a misfit
 DOUBTFUL_COVERED, DOUBTFUL_BURIED, DOUBTFUL_OUTWARD = 0.85, 0.01, 0.8  # the first with one of the others
 INSIDE_OUT, UNORIENTED = 0.25, 0.7  # shares of normals that point outward

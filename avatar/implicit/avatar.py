@@ -76,7 +76,7 @@ class ImplicitAvatar(nn.Module):
         self.texture = TextureField(inputs, self.sdf.mlp.channels, config.texture) if config.colored else None
 
     def pose_features(self, points: Tensor, joint_transforms: Tensor) -> Tensor:
-        """What each point is told of the pose, ``(B, N, P)``; see `PoseInput`."""
+        """Pose features ``(B, N, P)`` of each point; see `PoseInput`."""
         dims = check_shape("points", points, "B N 3")
         if self.config.pose is PoseInput.none:
             return points.new_zeros(*points.shape[:2], 0)
@@ -128,7 +128,7 @@ class ImplicitAvatar(nn.Module):
 
     @torch.no_grad()
     def pose_mesh(self, mesh: Mesh, joint_transforms: Tensor) -> Mesh:
-        """A canonical mesh carried to a pose by forward LBS with the field's weights, global motion included.
+        """A canonical mesh posed by forward LBS with the field's weights, global motion included.
 
         Args:
             mesh: of `canonical_mesh`, or any other in canonical space.
@@ -137,11 +137,11 @@ class ImplicitAvatar(nn.Module):
         vertices = torch.from_numpy(mesh.vertices).to(self.box)
         pose = joint_transforms[None].to(self.box)
 
-        def carry(chunk: slice) -> Tensor:
+        def pose_chunk(chunk: slice) -> Tensor:
             transforms = skin_transforms(self.field(vertices[chunk][None]), pose, self.canonical_from_bind)
             return transform_points(transforms, vertices[chunk][None])[0]
 
-        return replace(mesh, vertices=torch.cat(in_chunks(carry, len(vertices), CHUNK)).cpu().numpy())
+        return replace(mesh, vertices=torch.cat(in_chunks(pose_chunk, len(vertices), CHUNK)).cpu().numpy())
 
     def posed_mesh(self, joint_transforms: Tensor, config: ExtractionConfig | None = None) -> Mesh:
         """The dressed person in a pose, ``(J, 4, 4)`` posed_from_canonical: extracted, then posed."""

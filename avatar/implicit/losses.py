@@ -34,24 +34,24 @@ class ImplicitLossConfig:
 
 @dataclass(frozen=True)
 class FieldValues:
-    """Distances and their gradients where the losses look: on the scan, in space and on the sides of the box.
+    """Signed distances and their gradients at a step's query points.
 
-    ``surface (B, S)`` and ``surface_gradients (B, S, 3)`` at scan points; ``space_gradients (B, M, 3)`` near the
-    scan and in the box; ``empty (B, K)`` in the box; ``rim (B, R)`` on its sides; ``colors (B, S, 3)`` predicted.
+    ``surface (B, S)`` and ``surface_gradients (B, S, 3)`` at scan points; ``space_gradients (B, M, 3)`` near
+    the scan and in the box; ``uniform (B, K)`` in the box; ``boundary (B, R)`` on its sides; ``colors (B, S, 3)``.
     """
 
     surface: Tensor
     surface_gradients: Tensor
     space_gradients: Tensor
-    empty: Tensor
-    rim: Tensor
+    uniform: Tensor
+    boundary: Tensor
     colors: Tensor | None = None
 
 
 def implicit_loss(
     values: FieldValues, normals: Tensor, config: ImplicitLossConfig, colors: Tensor | None = None
 ) -> LossTerms:
-    """The objective of the implicit avatar, every part named.
+    """The training loss of the implicit avatar (SCANimate eqs. 14-17), every term named.
 
     Args:
         values: the field at the step's points.
@@ -69,8 +69,8 @@ def implicit_loss(
         "surface": values.surface.abs().mean(),
         "normal": (values.surface_gradients - normals).norm(dim=-1).mean(),
         "eikonal": (gradients.norm(dim=-1) - 1).square().mean(),
-        "off_surface": torch.exp(-config.sharpness * values.empty.abs()).mean(),
-        "box": (-values.rim).clamp(min=0).mean(),
+        "off_surface": torch.exp(-config.sharpness * values.uniform.abs()).mean(),
+        "box": (-values.boundary).clamp(min=0).mean(),
     }
     if values.colors is not None and colors is not None:
         check_shape("colors", colors, "B S 3", **dims)
@@ -80,8 +80,8 @@ def implicit_loss(
 
 
 @dataclass
-class ProbeConfig:
-    """Points in space of each frame and step, beside those on its scan; the paper's (appendix A.2)."""
+class QueryConfig:
+    """Numbers of query points of a frame and step, beside those on its scan; the paper's (appendix A.2)."""
 
     near_points: int = 10_000  # half about the scan, half about the body
     near_distance: float = 0.1  # metres, standard deviation of each coordinate
@@ -98,18 +98,18 @@ class ProbeConfig:
 
 
 @dataclass(frozen=True)
-class SpacePoints:
-    """Points in canonical space: ``near (B, M, 3)`` scan or body, ``empty (B, K, 3)`` anywhere, ``rim (B, R, 3)``."""
+class QueryPoints:
+    """Canonical query points: ``near (B, M, 3)`` scan or body, ``uniform (B, K, 3)``, ``boundary (B, R, 3)``."""
 
     near: Tensor
-    empty: Tensor
-    rim: Tensor
+    uniform: Tensor
+    boundary: Tensor
 
 
-def space_points(
-    scan: Tensor, body: Tensor, box: Tensor, config: ProbeConfig, generator: torch.Generator
-) -> SpacePoints:
-    """Draws the points in space of a step.
+def sample_queries(
+    scan: Tensor, body: Tensor, box: Tensor, config: QueryConfig, generator: torch.Generator
+) -> QueryPoints:
+    """Query points of a step: Gaussian about scan and body, uniform in the box and on its boundary.
 
     Args:
         scan: ``(B, S, 3)`` canonical scan points; body: ``(V, 3)`` canonical body; box: ``(2, 3)``; on one device.
@@ -127,15 +127,15 @@ def space_points(
     of_scan = (draw(config.near_points - about_body) * dims["S"]).long().clamp(max=dims["S"] - 1)
     of_body = (draw(about_body) * len(body)).long().clamp(max=len(body) - 1)
     anchors = torch.cat([scan.gather(1, of_scan[..., None].expand(-1, -1, 3)), body[of_body]], dim=1)
-    shaken = anchors + config.near_distance * torch.randn(anchors.shape, generator=generator).to(scan)
-    empty = draw(config.box_points, 3)
-    rim, side = draw(config.rim_points, 3), (draw(config.rim_points, 1) * 6).long().clamp(max=5)
-    rim = rim.scatter(2, side % 3, (side // 3).to(rim))
-    return SpacePoints(shaken, low + size * empty, low + size * rim)
+    near = anchors + config.near_distance * torch.randn(anchors.shape, generator=generator).to(scan)
+    uniform = draw(config.box_points, 3)
+    boundary, side = draw(config.rim_points, 3), (draw(config.rim_points, 1) * 6).long().clamp(max=5)
+    boundary = boundary.scatter(2, side % 3, (side // 3).to(boundary))
+    return QueryPoints(near, low + size * uniform, low + size * boundary)
 
 
-def probe_field(avatar: ImplicitAvatar, scan: Tensor, space: SpacePoints, joint_transforms: Tensor) -> FieldValues:
-    """Distances and their gradients at the points of a step, all asked at once, and colours where there are any.
+def query_field(avatar: ImplicitAvatar, scan: Tensor, space: QueryPoints, joint_transforms: Tensor) -> FieldValues:
+    """Distances and their gradients at the points of a step, in one evaluation, and colours where there are any.
 
     Gradients are those of the whole field, what the pose features change from place to place included. With
     gradients switched on they can be differentiated again, as training does.
@@ -143,23 +143,23 @@ def probe_field(avatar: ImplicitAvatar, scan: Tensor, space: SpacePoints, joint_
     Args:
         avatar: the field.
         scan: ``(B, S, 3)`` canonical scan points.
-        space: points in space.
+        space: query points.
         joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
     """
-    parts = [scan, space.near, space.empty, space.rim]
+    parts = [scan, space.near, space.uniform, space.boundary]
     learning = torch.is_grad_enabled()
     with torch.enable_grad():
         places = torch.cat(parts, dim=1).requires_grad_()
         distances = avatar(places, joint_transforms)
         (gradients,) = torch.autograd.grad(distances.sum(), places, create_graph=learning)
     counts = [part.shape[1] for part in parts]
-    surface, _, empty, rim = (distances if learning else distances.detach()).split(counts, dim=1)
+    surface, _, uniform, boundary = (distances if learning else distances.detach()).split(counts, dim=1)
     on_scan, near, in_box, _ = gradients.split(counts, dim=1)
     return FieldValues(
         surface=surface,
         surface_gradients=on_scan,
         space_gradients=torch.cat([near, in_box], dim=1),
-        empty=empty,
-        rim=rim,
+        uniform=uniform,
+        boundary=boundary,
         colors=None if avatar.texture is None else avatar.colors(scan, joint_transforms),
     )

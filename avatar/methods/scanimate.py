@@ -25,11 +25,11 @@ from avatar.implicit.fields import BodyField
 from avatar.implicit.losses import (
     TERMS,
     ImplicitLossConfig,
-    ProbeConfig,
-    SpacePoints,
+    QueryConfig,
+    QueryPoints,
     implicit_loss,
-    probe_field,
-    space_points,
+    query_field,
+    sample_queries,
 )
 from avatar.io.documents import read_yaml
 from avatar.methods.base import CANONICALIZER, SEED_STRIDE, Inputs, Method, Position, Stage, Task, TrainedAvatar
@@ -54,7 +54,7 @@ BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that t
 class ImplicitTrainConfig:
     """What training an implicit avatar has besides its budget (`TrainConfig`)."""
 
-    probes: ProbeConfig = field(default_factory=ProbeConfig)
+    probes: QueryConfig = field(default_factory=QueryConfig)
     loss: ImplicitLossConfig = field(default_factory=ImplicitLossConfig)
     decay: float = 0.1  # factor on the learning rate, on top of train.schedule, at each of
     decay_at: tuple[float, ...] = (0.5, 0.75)  # these shares of training (the paper's)
@@ -117,25 +117,25 @@ class ImplicitTask(Task):
         """The learning rate's factor: warm-up, the schedule's and the decays that are past."""
         return self.config.rate_factor(step, progress) * self.settings.rate_factor(progress)
 
-    def inputs_at(self, step: int) -> tuple[CanonicalBatch, SpacePoints]:
+    def inputs_at(self, step: int) -> tuple[CanonicalBatch, QueryPoints]:
         """The batch of a step and its points in space."""
         batch = self.data.batch_at(step, self.config.batch)
         return batch, self.space_at(batch, step)
 
-    def held_back(self) -> Iterator[tuple[CanonicalBatch, SpacePoints]]:
+    def held_back(self) -> Iterator[tuple[CanonicalBatch, QueryPoints]]:
         """The held-back frames, always at the same points."""
         for batch in self.checks.ordered() if self.checks else ():
             yield batch, self.space_at(batch, -1)
 
-    def space_at(self, batch: CanonicalBatch, key: int) -> SpacePoints:
+    def space_at(self, batch: CanonicalBatch, key: int) -> QueryPoints:
         """The points in space that a key draws for a batch on the CPU."""
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key + 1)
-        return space_points(batch.points, self.body, self.box, self.settings.probes, generator)
+        return sample_queries(batch.points, self.body, self.box, self.settings.probes, generator)
 
     def loss(self, inputs: Inputs, position: Position) -> LossTerms:
         """The field at a batch's points and at points in space, and its losses."""
         batch, space = inputs
-        values = probe_field(self.model, batch.points, space, batch.joint_transforms)
+        values = query_field(self.model, batch.points, space, batch.joint_transforms)
         return implicit_loss(values, batch.normals, self.settings.loss, batch.colors)
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:
