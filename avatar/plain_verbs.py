@@ -59,7 +59,7 @@ def convert_body() -> None:
     parser.add_argument("--uv", type=path, help="an OBJ of the same mesh whose texture coordinates POP is to use")
     paths = parser.parse_args()
 
-    from avatar.body.convert import convert_body_model
+    from avatar.body.smpl import convert_body_model
     from avatar.checks import AvatarError
 
     try:

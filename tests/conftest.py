@@ -8,8 +8,8 @@ import pytest
 from smpl_person import BETAS, person_model, write_model, write_person
 from tiny import write_tiny_outfit
 
-from avatar.body.convert import convert_body_model
-from avatar.data.open_layout import OpenOutfit
+from avatar.body.smpl import convert_body_model
+from avatar.data.layouts import OpenOutfit
 from avatar.data.scanner import ScanConfig
 from avatar.io import ledger
 

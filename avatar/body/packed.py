@@ -50,8 +50,7 @@ def sparse_weights(weights: np.ndarray, most: int | None = None) -> tuple[np.nda
 def dense_weights(ids: np.ndarray, values: np.ndarray, joints: int) -> np.ndarray:
     """Skinning weights ``(V, J)`` float32 from `sparse_weights`, or from integers in proportion to the weights.
 
-    Raises:
-        AvatarError: for a joint index out of range, a negative value, or a vertex without any weight.
+    Raises `AvatarError` for a joint index out of range, a negative value, or a vertex without any weight.
     """
     dims = check_shape("weight_joints", ids, "V K")
     check_shape("weight_values", values, "V K", **dims)
@@ -69,10 +68,8 @@ def dense_weights(ids: np.ndarray, values: np.ndarray, joints: int) -> np.ndarra
 def border_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
     """Where each joint's subtree meets the rest of the body, ``(J, 3)`` float64; NaN where it shares no vertex with it.
 
-    Vertices are averaged by ``s (1 - s)``, s being the sum of their weights over the subtree.
-
-    Raises:
-        AvatarError: for parents that are no tree, or weights of another shape.
+    Vertices are averaged by ``s (1 - s)``, s being the sum of their weights over the subtree. Raises `AvatarError` for
+    parents that are no tree, or weights of another shape.
     """
     check_parents(parents)
     check_shape("weights", weights, "V J", V=len(vertices), J=len(parents))
@@ -87,10 +84,8 @@ def border_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[i
 def joint_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
     """Joint positions ``(J, 3)`` estimated from the skinning weights alone: see `border_positions`.
 
-    The root has no such border and sits amid its children.
-
-    Raises:
-        AvatarError: for parents that are no tree, or naming the joint whose subtree shares no vertex with the rest.
+    The root has no such border and sits amid its children. Raises `AvatarError` for parents that are no tree, or naming
+    the joint whose subtree shares no vertex with the rest.
     """
     joints = border_positions(vertices, weights, parents)
     alone = np.flatnonzero(np.isnan(joints[1:, 0])) + 1
@@ -112,7 +107,7 @@ def read_template(path: Path) -> Template:
     try:
         template = _template(arrays, arrays["vertices"], arrays.get("joints"))
         if "canonical_from_bind" in arrays:
-            template = replace(template, canonical_from_bind=_float32(arrays["canonical_from_bind"]))
+            template = replace(template, canonical_from_bind=float32_tensor(arrays["canonical_from_bind"]))
         check_bind(template)
     except AvatarError as error:
         raise DataError(path, str(error)) from error
@@ -135,33 +130,31 @@ def packed_body(path: Path) -> BodyModel:
 
     The file holds ``vertices (V, 3)`` in the T-pose, ``faces (F, 3)``, ``parents (J,)``, ``joint_names (J,)``, the
     skinning weights as ``weights (V, J)`` or as ``weight_joints (V, K)`` and ``weight_values (V, K)``, and maybe
-    ``joints (J, 3)``, which are estimated from the weights where they are missing. A body whose weights were painted
-    in another pose has ``bind_vertices``, ``bind_joints`` and ``zero_from_bind (J, 4, 4)`` as well, or
+    ``joints (J, 3)``, which are estimated from the weights where they are missing. A body whose weights were painted in
+    another pose has ``bind_vertices``, ``bind_joints`` and ``zero_from_bind (J, 4, 4)`` as well, or
     ``canonical_from_bind (J, 4, 4)`` alone, from which they follow; ``pose_directions (V, 3, 9 (J - 1))`` are pose
     blendshapes as `BodyModel` takes them. A UV atlas, which POP and SCALE need, is ``uv (U, 2)`` in [0, 1] and
-    ``uv_faces (F, 3)``.
-
-    Raises:
-        DataError: for a missing or damaged file, missing keys, or arrays that do not make a body.
+    ``uv_faces (F, 3)``. Raises `DataError` for a missing or damaged file, missing keys, or arrays that do not make a
+    body.
     """
     arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
     bound = [key for key in BIND_KEYS if key in arrays]
-    directions = _float32(arrays.get("pose_directions"))
+    directions = float32_tensor(arrays.get("pose_directions"))
     try:
         if not bound:
             at_rest = _template(arrays, arrays["vertices"], arrays.get("joints"))
-            zero_from_bind = _float32(arrays.get("canonical_from_bind"))
+            zero_from_bind = float32_tensor(arrays.get("canonical_from_bind"))
             return BodyModel(_bind_of(at_rest, zero_from_bind), zero_from_bind, pose_directions=directions)
         if len(bound) < len(BIND_KEYS):
             raise AvatarError(f"bind pose: expected all of {', '.join(BIND_KEYS)} or none, got {', '.join(bound)}.")
         bind = _template(arrays, arrays["bind_vertices"], arrays["bind_joints"])
-        return BodyModel(bind, _float32(arrays["zero_from_bind"]), pose_directions=directions)
+        return BodyModel(bind, float32_tensor(arrays["zero_from_bind"]), pose_directions=directions)
     except (AvatarError, torch.linalg.LinAlgError) as error:  # transforms that cannot be inverted
         raise DataError(path, str(error)) from error
 
 
 def holds_template(path: Path) -> bool:
-    """Whether a file looks like a ``template.npz``, sound or not."""
+    """Whether a file looks like a ``template.npz``, valid or not."""
     try:
         with zipfile.ZipFile(path) as archive:
             return {"vertices.npy", "parents.npy"} <= set(archive.namelist())
@@ -172,8 +165,7 @@ def holds_template(path: Path) -> bool:
 def add_atlas(source: Path, target: Path, uv: Path) -> None:
     """Copies a ``template.npz`` with the UV atlas that an OBJ file has for its mesh.
 
-    Raises:
-        DataError: for a template or an OBJ that is not sound, or not of one mesh.
+    Raises `DataError` for an invalid template or OBJ, or two of different meshes.
     """
     packed_body(source)
     arrays = read_arrays(source, REQUIRED_KEYS, OPTIONAL_KEYS)
@@ -183,8 +175,7 @@ def add_atlas(source: Path, target: Path, uv: Path) -> None:
 def atlas_arrays(uv: Path, faces: np.ndarray, vertices: int) -> dict[str, np.ndarray]:
     """The UV atlas of an OBJ file as the arrays of a body's file.
 
-    Raises:
-        DataError: for an OBJ without texture coordinates or of another mesh.
+    Raises `DataError` for an OBJ without texture coordinates or of another mesh.
     """
     atlas = read_obj_atlas(uv, faces, vertices)
     if atlas is None:
@@ -246,6 +237,6 @@ def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.nd
     )
 
 
-def _float32(array: np.ndarray | None) -> Tensor | None:
+def float32_tensor(array: np.ndarray | None) -> Tensor | None:
     """A float32 tensor of an array, or None."""
     return None if array is None else torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

@@ -51,9 +51,8 @@ class BodyConfig:
 def load_body(config: BodyConfig) -> BodyModel:
     """The body a configuration names, float32.
 
-    Raises:
-        AvatarError: for a shape or a setting that does not exist, naming those that do.
-        DataError: for a missing or damaged file, with the way to a good one.
+    Raises `AvatarError` for a shape or a setting that does not exist, naming those that do; `DataError` for a missing
+    or damaged file, with the way to a good one.
     """
     body = BODIES[config.name](config)
     return body.with_canonical_pose(canonical_pose(config.canonical, body.joint_names))
@@ -67,9 +66,8 @@ def body_of_file(path: Path, settings: dict[str, Any], name: str = "") -> BodyMo
         settings: options of `BodyConfig` but ``name`` and ``path``; ``model``, if any, is what the file must hold.
         name: where the settings stand, for messages.
 
-    Raises:
-        AvatarError: for an unknown option.
-        DataError: for a missing or damaged file or one of another kind, with the command that makes a good one.
+    Raises `AvatarError` for an unknown option; `DataError` for a missing or damaged file or one of another kind, with
+    the command that makes a good one.
     """
     given = dict(settings)
     model = given.pop("model", None) or ("packed" if holds_template(path) else converted_kind(path))
@@ -79,8 +77,7 @@ def body_of_file(path: Path, settings: dict[str, Any], name: str = "") -> BodyMo
 def canonical_pose(name: str, joint_names: Sequence[str]) -> Tensor:
     """A canonical pose by name, ``(J, 3)`` axis-angle: ``t``, or ``apart`` with both hips turned outwards.
 
-    Raises:
-        AvatarError: for an unknown name, or a body without the joints it needs.
+    Raises `AvatarError` for an unknown name, or a body without the joints it needs.
     """
     if name not in CANONICAL_POSES:
         raise unknown_name("canonical pose", name, CANONICAL_POSES)

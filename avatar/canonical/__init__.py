@@ -1,1 +1,1 @@
-"""SCANimate's canonicalization: skinning weights as fields of space, and posed scans carried to the T-pose."""
+"""SCANimate's canonicalization: skinning weights as fields of space, and posed scans unposed to the T-pose."""

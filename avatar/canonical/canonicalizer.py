@@ -92,7 +92,7 @@ class Canonicalizer(nn.Module):
         return self.separate(points)
 
     def batch_codes(self, batch: ScanBatch) -> Tensor:
-        """What the inverse field is told of each frame of a batch, ``(B, L)``."""
+        """Conditioning of the inverse field on each frame of a batch, ``(B, L)``."""
         return batch.poses if self.config.latent is Latent.pose else pick(self.codes, batch.frames)
 
     def transforms(self, weights: Tensor, joint_transforms: Tensor) -> Tensor:
@@ -100,7 +100,7 @@ class Canonicalizer(nn.Module):
         return skin_transforms(weights, joint_transforms, self.canonical_from_bind)
 
     def forward(self, batch: ScanBatch, codes: Tensor, together: bool) -> Cycle:
-        """Carries a batch to canonical space, and back.
+        """Unposes a batch to canonical space, and poses it again.
 
         Args:
             batch: posed points in their root frames.

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.precision import full_precision
 
-BOX_MARGIN = 0.1  # of the box's longest side, added on every side: room for clothes around the body
+BOX_MARGIN = 0.1  # of the box's longest side, added on every side: space for clothes around the body
 
 
 @dataclass
@@ -107,5 +107,5 @@ def bounding_box(points: Tensor, margin: float = BOX_MARGIN) -> Tensor:
     """The box ``(..., 2, 3)`` of points ``(..., N, 3)``, with a share of its longest side added on every side."""
     check_finite("points", points)
     low, high = points.amin(dim=-2), points.amax(dim=-2)
-    room = margin * (high - low).amax(dim=-1, keepdim=True)
-    return torch.stack([low - room, high + room], dim=-2)
+    pad = margin * (high - low).amax(dim=-1, keepdim=True)
+    return torch.stack([low - pad, high + pad], dim=-2)

@@ -1,16 +1,50 @@
-"""Posed scans unposed to the canonical pose, without the triangles that this tears (SCANimate 3.1, appendix A.4)."""
+"""Skinning weights of the nearest body, and inverse LBS of scans to the canonical pose (SCANimate 3.1, 4.1, A.4)."""
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from avatar.body.skinning import skin_transforms
-from avatar.canonical.edges import neighbour_edges
-from avatar.canonical.posed import root_joint_transforms, to_root_frame
+from avatar.canonical.posed import nearest_ids, neighbour_edges, root_joint_transforms, to_root_frame
 from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.transforms import invert_affine, transform_points
-from avatar.records import BodyFit, CanonicalScan, Scan, Template
+from avatar.records import BodyFit, CanonicalScan, Frame, Scan, Template
+
+KNN = 6  # the paper's number of neighbours
+
+
+class SkinningSource(Protocol):
+    """What gives posed points their skinning weights."""
+
+    def weights_of(self, points: np.ndarray, frame: Frame) -> np.ndarray:
+        """Weights ``(M, J)``, rows summing to 1, of posed points ``(M, 3)`` in the frame's world, metres."""
+        ...
+
+
+class NearestBody:
+    """Weights of the nearest posed body vertices, by inverse distance; of the nearest alone for one neighbour."""
+
+    def __init__(self, template: Template, neighbours: int = 1):
+        """Takes the body's weights. Raises `AvatarError` for fewer than one neighbour or more than vertices."""
+        if not 1 <= neighbours <= len(template.vertices):
+            raise AvatarError(f"neighbours: expected 1 to {len(template.vertices)}, got {neighbours}.")
+        self.template, self.weights, self.neighbours = template, template.weights.numpy(), neighbours
+
+    def weights_of(self, points: np.ndarray, frame: Frame) -> np.ndarray:
+        """Weights ``(M, J)`` of posed points ``(M, 3)`` in the frame's world, metres."""
+        return self.blend_weights(points, frame.body.vertices)
+
+    def blend_weights(self, points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """Weights ``(M, J)`` of points ``(M, 3)`` beside the body at ``vertices (V, 3)``, posed or at rest, metres."""
+        check_shape("points", points, "M 3")
+        distances, ids = nearest_ids(vertices, points, self.neighbours)
+        closeness = 1 / np.maximum(distances, 1e-9)
+        closeness /= closeness.sum(axis=1, keepdims=True)
+        return np.einsum("mk,mkj->mj", closeness, self.weights[ids]).astype(np.float32)
+
 
 STRETCH = 4.0  # longest that an edge may become, as a multiple of its length in the scan
 TORN_SHARE = 0.5  # of a point's edges to its neighbours, beyond which a point scan loses it
@@ -32,8 +66,7 @@ def canonicalize_scan(
         template: the body at rest in its canonical pose.
         stretch: see above; infinity keeps everything.
 
-    Raises:
-        AvatarError: for weights that do not fit, or when nothing is left of the scan.
+    Raises `AvatarError` for weights that do not fit, or when nothing is left of the scan.
     """
     check_shape("weights", weights, "M J", M=len(scan.points), J=len(template.parents))
     check_finite("weights", weights)

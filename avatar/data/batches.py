@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -13,8 +15,52 @@ from torch.utils.data import Dataset
 from avatar.checks import AvatarError
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import frame_seed
-from avatar.data.streaming import MAX_BYTES, LruSequence
 from avatar.records import Batch, Frame
+
+MAX_BYTES = 1 << 30  # bytes of one sequence's items kept in memory: with torch and a network's work below 2 GiB
+Item = TypeVar("Item")
+
+
+class LruSequence(Sequence[Item]):
+    """A sequence of any length in bounded memory; the least recently used items leave first.
+
+    What an item is must follow from its index alone, for it may be read again.
+    """
+
+    def __init__(self, read: Callable[[int], Item], count: int, max_bytes: int = MAX_BYTES):
+        """Prepares a sequence of ``count`` items; none is read yet.
+
+        Args:
+            read: gives an item, a dataclass of arrays or tensors, by its index.
+            count: how many there are.
+            max_bytes: bytes that items may be kept in.
+        """
+        self.read, self.count, self.left = read, count, max(max_bytes, 0)
+        self.kept: OrderedDict[int, Item] = OrderedDict()
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Item:
+        if not 0 <= index < self.count:
+            raise IndexError(f"index: expected 0 to {self.count - 1}, got {index}.")
+        if index in self.kept:
+            self.kept.move_to_end(index)
+            return self.kept[index]
+        item = self.read(index)
+        self.kept[index] = item
+        self.left -= bytes_of(item)
+        while self.left < 0:
+            _, leaving = self.kept.popitem(last=False)
+            self.left += bytes_of(leaving)
+        return item
+
+
+def bytes_of(value: Any) -> int:
+    """Memory that the arrays and tensors of a dataclass, or of dataclasses within it, take."""
+    if is_dataclass(value):
+        return sum(bytes_of(getattr(value, part.name)) for part in fields(value))
+    return getattr(value, "nbytes", 0)
 
 
 @dataclass(frozen=True)
@@ -64,8 +110,7 @@ class FrameDataset(Dataset):
             seed: of the order and of the subsets.
             cache_bytes: memory that frames may be kept in; the least recently used leave first.
 
-        Raises:
-            AvatarError: without frames, or for outfits whose bodies are not of one topology.
+        Raises `AvatarError` without frames, or for outfits whose bodies are not of one topology.
         """
         if not names or points < 1:
             raise AvatarError(f"names, points: expected at least 1 each, got {len(names)} and {points}.")
@@ -110,27 +155,9 @@ class FrameDataset(Dataset):
         where = self.names[index]
         return self.outfits[where.outfit].load(where.split, where.name)
 
-    def order(self, epoch: int) -> np.ndarray:
-        """The permutation in which an epoch goes through the frames, ``(len,)``."""
-        return np.random.default_rng(frame_seed(self.seed, f"order/{epoch}")).permutation(len(self))
-
     def batch_at(self, step: int, size: int) -> Batch:
         """The batch of a training step: epochs follow each other without a gap, so every batch is full."""
-        items = []
-        for place in range(step * size, (step + 1) * size):
-            epoch, offset = divmod(place, len(self))
-            items.append(self.item(epoch, int(self.order(epoch)[offset])))
-        return collate(items)
-
-    def epoch_length(self, size: int) -> int:
-        """Steps after which every frame has been seen once, for `batch_at`."""
-        return -(-len(self) // size)
-
-    def epoch_batches(self, epoch: int, size: int) -> Iterator[Batch]:
-        """All frames once in the order of an epoch; the last batch may be smaller."""
-        order = self.order(epoch).tolist()
-        for start in range(0, len(order), size):
-            yield collate([self.item(epoch, index) for index in order[start : start + size]])
+        return collate([self.item(epoch, index) for epoch, index in step_frames(self.seed, step, size, len(self))])
 
     def ordered_batches(self, size: int) -> Iterator[Batch]:
         """All frames once in the order of ``names``, always with the same scan points: for validation."""
@@ -141,6 +168,14 @@ class FrameDataset(Dataset):
 def name_frames(outfits: Sequence[Outfit], split: str, names: Sequence[Sequence[str]]) -> tuple[FrameName, ...]:
     """Frame names of several outfits, one list an outfit, as `FrameDataset` takes them."""
     return tuple(FrameName(i, split, name) for i, _ in enumerate(outfits) for name in names[i])
+
+
+def step_frames(seed: int, step: int, size: int, count: int) -> Iterator[tuple[int, int]]:
+    """Epoch and index of the frames of a training step; each epoch is a permutation of ``count`` frames."""
+    for place in range(step * size, (step + 1) * size):
+        epoch, offset = divmod(place, count)
+        order = np.random.default_rng(frame_seed(seed, f"order/{epoch}")).permutation(count)
+        yield epoch, int(order[offset])
 
 
 def draw_points(available: int, count: int, rng: np.random.Generator) -> np.ndarray:

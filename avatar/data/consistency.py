@@ -13,7 +13,10 @@ from avatar.checks import DataError
 from avatar.records import Template
 
 JOINT_GAP, JOINTS_GAP = 0.25, 0.12  # metres from a joint to its weights' border: one, median (open body: 0.13, 0.04)
-APART, SHARE = 0.05, 0.99  # metres between two posed bodies at that share of their vertices: room for lost blendshapes
+APART, SHARE = (
+    0.05,
+    0.99,
+)  # metres between posed bodies at that share of vertices: margin for lost blendshapes
 EDGE_ERROR = 0.18  # of the edges' length: 0.03 to 0.10 where right (sample outfits), 0.27 and more for no rotation
 
 
@@ -21,10 +24,8 @@ def check_joints(template: Template, path: Path) -> None:
     """Refuses joints that do not lie where the skinning weights of their subtree end.
 
     A joint turns its subtree about itself, so it lies near the border at which the subtree's weights fade
-    (`joint_positions`). Joints without such a border are not judged.
-
-    Raises:
-        DataError: with the largest gap and the likely cause.
+    (`joint_positions`). Joints without such a border are not judged. Raises `DataError` with the largest gap and the
+    likely cause.
     """
     vertices, weights = template.vertices.numpy(), template.weights.numpy()
     borders = border_positions(vertices, weights, template.parents)
@@ -59,8 +60,7 @@ def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Te
         template: the body at rest.
         path: the frame's file.
 
-    Raises:
-        DataError: with the distance between the two and the likely cause.
+    Raises `DataError` with the distance between the two and the likely cause.
     """
     apart = _apart(posed, vertices)
     if apart <= APART:
@@ -84,7 +84,7 @@ def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Te
     raise DataError(path, f"{problem} {apart:.3f} m or more away.", hint)
 
 
-def check_carried(transforms: np.ndarray, template: Template, vertices: np.ndarray, path: Path) -> None:
+def check_vertex_transforms(transforms: np.ndarray, template: Template, vertices: np.ndarray, path: Path) -> None:
     """Refuses ``vtransf`` that does not turn the edges of the body at rest onto those of the posed body.
 
     Args:
@@ -93,8 +93,7 @@ def check_carried(transforms: np.ndarray, template: Template, vertices: np.ndarr
         vertices: ``(V, 3)`` the frame's body.
         path: the frame's file.
 
-    Raises:
-        DataError: with the mean error in lengths of the edges and the likely cause.
+    Raises `DataError` with the mean error in lengths of the edges and the likely cause.
     """
     linear = transforms[:, :3, :3].astype(np.float64)
     starts, ends = template.faces[:, :2].flatten().numpy(), template.faces[:, 1:].flatten().numpy()
@@ -102,21 +101,21 @@ def check_carried(transforms: np.ndarray, template: Template, vertices: np.ndarr
     posed = vertices[ends].astype(np.float64) - vertices[starts]
     lengths = np.linalg.norm(rest, axis=1).sum()
 
-    def carry(linear: np.ndarray) -> np.ndarray:
+    def pose_edges(linear: np.ndarray) -> np.ndarray:
         return np.einsum("eij,ej->ei", (linear[starts] + linear[ends]) / 2, rest)
 
     def error(edges: np.ndarray) -> float:
         return float(np.linalg.norm(edges - posed, axis=1).sum() / lengths)
 
-    carried = carry(linear)
-    found, transposed = error(carried), error(carry(np.swapaxes(linear, 1, 2)))
+    skinned = pose_edges(linear)
+    found, transposed = error(skinned), error(pose_edges(np.swapaxes(linear, 1, 2)))
     backwards = transposed < found / 2
     if found <= (EDGE_ERROR / 2 if backwards else EDGE_ERROR):
         return
-    turn, _ = Rotation.align_vectors(posed, carried)
+    turn, _ = Rotation.align_vectors(posed, skinned)
     if backwards:
         hint = "Transposed it does: store posed_from_rest, not its inverse, in matrices that multiply columns."
-    elif error(turn.apply(carried)) <= EDGE_ERROR:
+    elif error(turn.apply(skinned)) <= EDGE_ERROR:
         degrees = np.degrees(turn.magnitude())
         hint = f"Turned by {degrees:.0f} degrees as a whole it does: is the root's rotation in both?"
     elif np.abs(linear - np.eye(3)).max() < 1e-3:

@@ -1,8 +1,8 @@
 """Raw scans as meshes: what a scanner's fusion makes of a dressed body, with the truth kept beside every vertex.
 
 Where surfaces touch (an arm on the trunk, the legs, cloth on cloth) a real fused mesh is one sheet: what lies inside
-the contact is gone, and triangles of both sides share the vertices at its rim. That, noise and holes are what learned
-canonicalization (SCANimate 3.1) has to cope with; the perfect mesh of `scanner.scan_mesh` has none of it.
+the contact is gone, and triangles of both sides share the vertices at its boundary. That, noise and holes are what
+learned canonicalization (SCANimate 3.1) has to cope with; the perfect mesh of `scanner.scan_mesh` has none of it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import torch
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from avatar.data.patterns import paint
 from avatar.data.scanner import (
     DressedSurface,
     ScanConfig,
@@ -22,6 +21,7 @@ from avatar.data.scanner import (
     frame_seed,
     keep_points,
     outside_holes,
+    paint,
     scan_mesh,
 )
 from avatar.geometry.surface import vertex_normals
@@ -29,8 +29,8 @@ from avatar.geometry.trees import build_tree
 from avatar.records import Scan
 
 CORNERS = np.arange(3)
-CRUMB = 30  # faces; smaller pieces are what scanning software throws away
-NEARBY = 64  # nearest vertices in which a rim looks for another surface
+SMALLEST_COMPONENT = 30  # faces; smaller pieces are what scanning software throws away
+NEARBY = 64  # nearest vertices in which a boundary vertex looks for another surface
 FAR_AT_REST = 4  # times the merging distance: vertices as far apart at rest are on different parts of a surface
 NOISE_ROUNDS = 3  # times each vertex's noise is blended with its neighbours': fusion has averaged many depth images
 CHILDREN = {  # number of split edges: triangles over corners 0 1 2 and the middles 3 4 5 of edges 01 12 20
@@ -51,8 +51,7 @@ def fuse_mesh(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan:
         config: longest edge, merging, noise, holes, pattern, seed; ``points`` does not matter.
         frame: the frame's name, part of the random seed.
 
-    Raises:
-        AvatarError: when nothing can be seen, or holes have taken every point.
+    Raises `AvatarError` when nothing can be seen, or holes have taken every point.
     """
     rng = np.random.default_rng(frame_seed(config.seed, frame))
     scan = split_long_edges(scan_mesh(surface), config.edge)
@@ -62,7 +61,7 @@ def fuse_mesh(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan:
         scan = replace(scan, points=scan.points + fused_noise(scan, config.noise, rng))
     if config.holes:
         scan = keep_points(scan, outside_holes(scan.points, config.holes, config.hole_radius, rng))
-        scan = drop_crumbs(scan)
+        scan = drop_small_components(scan)
     return paint(replace(scan, normals=_face_normals(scan)), config.pattern)
 
 
@@ -109,34 +108,34 @@ def weld_contacts(scan: Scan, distance: float, rng: np.random.Generator) -> Scan
     """Joins surfaces closer than a distance into one sheet, as fusion does.
 
     Where two surfaces face each other, the faces between them are dropped. What is left of them there, and every open
-    rim near another surface (what lies in the shade of an arm on the trunk was never seen, a sleeve ends on skin), is
-    joined: vertices and those they look at become one in their middle, so that triangles of both surfaces share them.
+    boundary near another surface (a region hidden by an arm was never seen, a sleeve ends on skin), is joined: vertices
+    and those they face become one in their middle, so that triangles of both surfaces share them.
     """
     facing = facing_partners(scan.points, scan.normals, distance)
     inside = np.zeros(len(scan.points), bool)
     inside[np.concatenate(facing)] = True
     faces = scan.faces[~inside[scan.faces].all(axis=1)]
-    rims = rim_partners(scan, distance)
-    count, group = _join(np.concatenate([facing[0], rims[0]]), np.concatenate([facing[1], rims[1]]), len(inside))
-    speaker = np.empty(count, np.int64)  # whose truth a group keeps: the last one in a random order
+    borders = boundary_partners(scan, distance)
+    count, group = _join(np.concatenate([facing[0], borders[0]]), np.concatenate([facing[1], borders[1]]), len(inside))
+    kept_of = np.empty(count, np.int64)  # whose truth a group keeps: the last one in a random order
     order = rng.permutation(len(inside))
-    speaker[group[order]] = order
+    kept_of[group[order]] = order
     sums = np.stack([np.bincount(group, column, count) for column in scan.points.T.astype(np.float64)], axis=1)
     middles = sums / np.bincount(group, minlength=count)[:, None]
     faces = group[faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     joined = Scan(
         points=middles.astype(np.float32),
-        normals=scan.normals[speaker],
+        normals=scan.normals[kept_of],
         faces=faces,
-        labels=scan.labels[speaker],
-        canonical=scan.canonical[speaker],
+        labels=scan.labels[kept_of],
+        canonical=scan.canonical[kept_of],
     )
-    return drop_crumbs(joined)
+    return drop_small_components(joined)
 
 
-def rim_partners(scan: Scan, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices on open rims that come close to another surface, and the nearest vertex of that.
+def boundary_partners(scan: Scan, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices on open boundaries that come close to another surface, and the nearest vertex of that.
 
     Another surface is another garment, the skin, or a part of the same that is far away at rest.
 
@@ -144,15 +143,15 @@ def rim_partners(scan: Scan, distance: float) -> tuple[np.ndarray, np.ndarray]:
         Two index arrays ``(K,)``.
     """
     links = _links(scan)
-    rim = np.flatnonzero(np.abs(links - links.T).sum(axis=1))  # an edge that no other face runs along the other way
+    boundary = np.flatnonzero(np.abs(links - links.T).sum(axis=1))  # edges that no face runs along the other way
     nearby = min(NEARBY, len(scan.points))
-    distances, ids = build_tree(scan.points).query(scan.points[rim], k=nearby, distance_upper_bound=distance)
+    distances, ids = build_tree(scan.points).query(scan.points[boundary], k=nearby, distance_upper_bound=distance)
     known = np.isfinite(distances)
     ids = np.where(known, ids, 0)
-    apart = np.linalg.norm(scan.canonical[ids] - scan.canonical[rim, None], axis=-1) > FAR_AT_REST * distance
-    other = known & (apart | (scan.labels[ids] != scan.labels[rim, None]))
+    apart = np.linalg.norm(scan.canonical[ids] - scan.canonical[boundary, None], axis=-1) > FAR_AT_REST * distance
+    other = known & (apart | (scan.labels[ids] != scan.labels[boundary, None]))
     near = other.any(axis=1)
-    return rim[near], ids[near, other[near].argmax(axis=1)]
+    return boundary[near], ids[near, other[near].argmax(axis=1)]
 
 
 def _join(first: np.ndarray, second: np.ndarray, count: int) -> tuple[int, np.ndarray]:
@@ -172,11 +171,11 @@ def fused_noise(scan: Scan, noise: float, rng: np.random.Generator) -> np.ndarra
     return (noise * waves / waves.std()).astype(np.float32)
 
 
-def drop_crumbs(scan: Scan) -> Scan:
+def drop_small_components(scan: Scan) -> Scan:
     """The mesh without its smallest pieces, and without vertices that no face uses."""
     _, piece = connected_components(_links(scan), directed=False)
     faces_of = np.bincount(piece[scan.faces[:, 0]], minlength=piece.max() + 1)
-    kept = (faces_of >= min(CRUMB, faces_of.max()))[piece]
+    kept = (faces_of >= min(SMALLEST_COMPONENT, faces_of.max()))[piece]
     return keep_points(scan, kept)
 
 

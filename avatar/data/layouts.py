@@ -1,19 +1,137 @@
-"""Which layout an outfit's folder has, and opening it."""
+"""The open dataset's layout, whose compact simulated frames are scanned when loaded; and opening any outfit."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
-from avatar.checks import DataError
-from avatar.data.open_layout import OpenOutfit
-from avatar.data.outfits import Outfit, outfit_folder, read_outfit_settings
-from avatar.data.packed_layout import PackedOutfit
-from avatar.data.scanner import ScanConfig
+import numpy as np
+import torch
+from torch import Tensor
 
-LAYOUTS = {
-    "open": OpenOutfit,
-    "packed": lambda path, dataset, scanner: PackedOutfit(path, dataset),
-}
+from avatar.body.model import BodyModel
+from avatar.body.open import MEAN_SHAPE, open_body
+from avatar.body.packed import packed_body
+from avatar.body.registry import canonical_pose
+from avatar.checks import AvatarError, DataError
+from avatar.data.fusion import fuse_mesh
+from avatar.data.outfits import Outfit, SurfaceOutfit, outfit_folder, read_outfit_settings
+from avatar.data.packed_layout import PackedOutfit
+from avatar.data.scanner import DressedSurface, ScanConfig, paint, scan_mesh, scan_points
+from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_garment
+from avatar.records import BodyFit, Frame, Scan, Template
+
+
+class OpenOutfit(SurfaceOutfit):
+    """An outfit of the open dataset: ``outfit.yaml``, ``garment.npz`` and frames of cloth and visibility."""
+
+    def __init__(self, path: Path, dataset: str = "", scanner: ScanConfig | None = None):
+        super().__init__(path, dataset)
+        self.scanner = scanner or ScanConfig()
+        settings = read_outfit_settings(self.path)
+        body = settings.get("body") if isinstance(settings.get("body"), dict) else {}
+        named = body.get("model") == "open" and isinstance(body.get("shape"), str)
+        if not named and body.get("model") != "packed":
+            expected = "{model: open, shape, canonical} or {model: packed, canonical} with a body.npz"
+            raise DataError(self.path / "outfit.yaml", f"body: expected {expected}, got {settings.get('body')}.")
+        self._shape: str | None = body["shape"] if named else None  # of the open body; None: body.npz is the subject
+        self._canonical = str(body.get("canonical", "t"))
+
+    @cached_property
+    def garment(self) -> OpenGarment:
+        """The cloth's topology, its rest in the canonical pose and its labels."""
+        return read_open_garment(self.path / "garment.npz")
+
+    @cached_property
+    def body(self) -> BodyModel:
+        """The subject."""
+        if self._shape is not None:
+            return self._make_body(self._shape)
+        path = self.path / "body.npz"
+        body = packed_body(path)
+        if not torch.equal(body.faces, self.mean_body.faces):
+            raise DataError(path, "faces: expected those of the open body.", "Make the body with tools/make_body.py.")
+        return body.with_canonical_pose(self.mean_body.canonical_pose)
+
+    @cached_property
+    def mean_body(self) -> BodyModel:
+        """The mean of all open shapes, in the same canonical space."""
+        return self._make_body(MEAN_SHAPE)
+
+    def _make_body(self, shape: str) -> BodyModel:
+        """An open body in the outfit's canonical pose."""
+        try:
+            body = open_body(shape)
+            return body.with_canonical_pose(canonical_pose(self._canonical, body.joint_names))
+        except DataError:
+            raise
+        except AvatarError as error:
+            raise DataError(self.path / "outfit.yaml", f"body: {error}") from error
+
+    def _read_template(self) -> Template:
+        return self.body.template
+
+    def _read_frame(self, path: Path, split: str, name: str) -> Frame:
+        stored = self._read_open_frame(path)
+        body = self.fit_pose(stored.pose, stored.translation)
+        surface = self._surface(stored, body.vertices)
+        scan = fuse_mesh if self.scanner.mesh else scan_points
+        return Frame(name, self.name, split, body, scan(surface, self.scanner, f"{self.name}/{name}"))
+
+    def resample(self, split: str, name: str, points: int, seed: int) -> Scan:
+        """A fresh, perfect sampling of a frame's visible surface, independent of the scanner's noise and holes."""
+        config = ScanConfig(points=points, seed=seed, pattern=self.scanner.pattern)
+        return scan_points(self.load_surface(split, name), config, f"{self.name}/{name}/again")
+
+    def load_mesh(self, split: str, name: str) -> Scan:
+        """What can be seen of a frame as a perfect mesh: a scan with faces, labels and canonical positions."""
+        return paint(scan_mesh(self.load_surface(split, name)), self.scanner.pattern)
+
+    def load_body(self, split: str, name: str) -> BodyFit:
+        """The body under a frame, without its scan."""
+        stored = self._read_open_frame(self.frame_path(split, name))
+        return self.fit_pose(stored.pose, stored.translation)
+
+    def load_surface(self, split: str, name: str) -> DressedSurface:
+        """Body and cloth of a frame as one labelled mesh with its visible faces."""
+        stored = self._read_open_frame(self.frame_path(split, name))
+        return self._surface(stored, self.fit_pose(stored.pose, stored.translation).vertices)
+
+    def _read_open_frame(self, path: Path) -> OpenFrame:
+        """A stored frame that fits the outfit's body and garment."""
+        stored = read_open_frame(path)
+        expected = {
+            "pose": (len(self.body.parents), 3),
+            "cloth": self.garment.canonical.shape,
+            "visible_body": (len(self.body.faces),),
+            "visible_cloth": (len(self.garment.faces),),
+        }
+        for key, shape in expected.items():
+            if getattr(stored, key).shape != shape:
+                problem = f"{key}: expected {shape} as body and garment.npz have it, got {getattr(stored, key).shape}."
+                raise DataError(path, problem, "Frame and garment are of different outfits.")
+        return stored
+
+    def _surface(self, stored: OpenFrame, body_vertices: np.ndarray) -> DressedSurface:
+        """Body and cloth as one mesh."""
+        template, garment = self.template, self.garment
+        skin = np.zeros(len(body_vertices), np.uint8)
+        return DressedSurface(
+            vertices=_stack([body_vertices, stored.cloth]),
+            canonical=_stack([template.vertices.numpy(), garment.canonical]),
+            faces=_stack([template.faces.numpy(), garment.faces + len(body_vertices)]),
+            visible=_stack([stored.visible_body, stored.visible_cloth]),
+            labels=_stack([skin, garment.labels]),
+        )
+
+
+def _stack(parts: Sequence[np.ndarray]) -> Tensor:
+    """Arrays one after the other, as a tensor."""
+    return torch.from_numpy(np.concatenate(parts))
+
+
+LAYOUTS = ("open", "packed")
 
 
 def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | None = None) -> Outfit:
@@ -25,9 +143,8 @@ def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | Non
         outfit: the outfit's folder name.
         scanner: how simulated frames are scanned; a perfect scanner if None. Real scans are as they are.
 
-    Raises:
-        AvatarError: for names that could leave the data root.
-        DataError: naming the outfits there are, or what is wrong with this one.
+    Raises `AvatarError` for names that could leave the data root; `DataError` naming the outfits there are, or what is
+    wrong with this one.
     """
     return open_outfit_folder(outfit_folder(root, dataset, outfit), dataset, scanner)
 
@@ -35,12 +152,11 @@ def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | Non
 def open_outfit_folder(path: Path, dataset: str = "", scanner: ScanConfig | None = None) -> Outfit:
     """An outfit by its folder; the layout is what ``outfit.yaml`` says, or what its files show.
 
-    Raises:
-        DataError: for an unknown layout, naming those there are.
+    Raises `DataError` for an unknown layout, naming those there are.
     """
     path = Path(path)
     shown = "open" if (path / "garment.npz").is_file() else "packed"
     layout = read_outfit_settings(path).get("layout", shown)
     if layout not in LAYOUTS:
         raise DataError(path / "outfit.yaml", f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}.")
-    return LAYOUTS[layout](path, dataset, scanner)
+    return OpenOutfit(path, dataset, scanner) if layout == "open" else PackedOutfit(path, dataset)

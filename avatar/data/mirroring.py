@@ -26,8 +26,7 @@ class MirrorMap:
 def mirror_map(template: Template) -> MirrorMap:
     """The left-right symmetry of a template in a symmetric canonical pose.
 
-    Raises:
-        AvatarError: when more than 1% of the vertices have no mirror image within 5 mm, or joints have no partner.
+    Raises `AvatarError` when more than 1% of the vertices have no mirror image within 5 mm, or joints have no partner.
     """
     mirrored = template.vertices * ACROSS.diagonal()[:3]
     ids = nearest(mirrored[None], template.vertices[None])[0]

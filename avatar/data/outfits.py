@@ -44,8 +44,7 @@ class Outfit(ABC):
     def template(self) -> Template:
         """The body at rest in its canonical pose, float32.
 
-        Raises:
-            DataError: for a missing or damaged file, or a body that is not in metres or not at its joints.
+        Raises `DataError` for a missing or damaged file, or a body that is not in metres or not at its joints.
         """
         template = self._read_template()
         check_template(template, self.path)
@@ -55,9 +54,8 @@ class Outfit(ABC):
     def frames(self, split: str) -> tuple[str, ...]:
         """Names of the frames of a split, sorted.
 
-        Raises:
-            AvatarError: for a split other than train and test, and validation where frames are held back.
-            DataError: when the split's folder is missing or empty.
+        Raises `AvatarError` for a split other than train and test, and validation where frames are held back;
+        `DataError` when the split's folder is missing or empty.
         """
         if split == VALIDATION and self.held_back:
             return self.held_back
@@ -65,7 +63,9 @@ class Outfit(ABC):
             held = ", or validation where frames were held back from training" if split == VALIDATION else ""
             near = did_you_mean(split, (*SPLITS, VALIDATION))
             raise AvatarError(sentences(f"split: expected train or test{held}, got {split!r}.", near))
-        return self._listed[split] or self._refuse_empty(split)
+        if not self._listed[split]:
+            raise DataError(self.path / split, "expected frames (*.npz), found none.", "Make or download the data.")
+        return self._listed[split]
 
     def has_frames(self, split: str) -> bool:
         """Whether there are frames of a split: data may come without a test folder, or with an empty one."""
@@ -74,8 +74,7 @@ class Outfit(ABC):
     def with_validation(self, names: Sequence[str]) -> Self:
         """The same outfit with some of its training frames as a split of their own, ``validation``, as well.
 
-        Raises:
-            AvatarError: for a frame that is not among those of training.
+        Raises `AvatarError` for a frame that is not among those of training.
         """
         for name in names:
             self.frame_path("train", name)
@@ -86,9 +85,8 @@ class Outfit(ABC):
     def load(self, split: str, name: str) -> Frame:
         """One frame, checked: finite, in metres, scan over body.
 
-        Raises:
-            AvatarError: for a frame that is not in the split, naming near ones.
-            DataError: for a damaged or unsound file.
+        Raises `AvatarError` for a frame that is not in the split, naming near ones; `DataError` for a damaged or
+        invalid file.
         """
         path = self.frame_path(split, name)
         frame = self._read_frame(path, split, name)
@@ -138,8 +136,7 @@ class Outfit(ABC):
             pose: ``(J, 3)`` axis-angle, radians, relative to the parent and to the T-pose.
             translation: ``(3,)`` metres; zero if None.
 
-        Raises:
-            AvatarError: for a pose of other joints, or where the outfit has no body that can be posed.
+        Raises `AvatarError` for a pose of other joints, or where the outfit has no body that can be posed.
         """
         body = self.posable_body()
         check_pose(pose, len(body.parents))
@@ -171,10 +168,6 @@ class Outfit(ABC):
         """The same names for look-ups."""
         return {split: frozenset(names) for split, names in self._listed.items()}
 
-    def _refuse_empty(self, split: str) -> tuple[str, ...]:
-        """The error of a split without frames."""
-        raise DataError(self.path / split, "expected frames (*.npz), found none.", "Make or download the data.")
-
     @abstractmethod
     def _read_template(self) -> Template:
         """The body at rest, from the layout's files."""
@@ -199,8 +192,7 @@ class SurfaceOutfit(Outfit):
 def read_outfit_settings(path: Path) -> dict[str, Any]:
     """What an outfit's ``outfit.yaml`` says, or nothing where there is none.
 
-    Raises:
-        DataError: for a file that is not a plain mapping, or of an unknown format.
+    Raises `DataError` for a file that is not a plain mapping, or of an unknown format.
     """
     file = Path(path) / "outfit.yaml"
     if not file.is_file():
@@ -214,11 +206,8 @@ def read_outfit_settings(path: Path) -> dict[str, Any]:
 def outfit_folder(root: Path, dataset: str, outfit: str) -> Path:
     """The folder of an outfit: ``<root>/<dataset>/<outfit>``, or the embedded one for the dataset ``sample``.
 
-    POP's nesting ``<root>/<dataset>/packed/<outfit>`` is found as well.
-
-    Raises:
-        AvatarError: for names that could leave the data root.
-        DataError: for a data set or an outfit that is not there, naming those that are.
+    POP's nesting ``<root>/<dataset>/packed/<outfit>`` is found as well. Raises `AvatarError` for names that could leave
+    the data root; `DataError` for a data set or an outfit that is not there, naming those that are.
     """
     check_name("dataset", dataset)
     check_name("outfit", outfit)

@@ -16,7 +16,7 @@ from avatar.body.packed import write_body, write_template
 from avatar.body.registry import body_of_file, canonical_name
 from avatar.body.skinning import blend_transforms, skin_transforms
 from avatar.checks import AvatarError, DataError, check_shape, require
-from avatar.data.consistency import check_carried, check_posed
+from avatar.data.consistency import check_posed, check_vertex_transforms
 from avatar.data.outfits import OUTFIT_FORMAT, SPLITS, Outfit, read_outfit_settings
 from avatar.data.validation import check_pose, check_size
 from avatar.geometry.transforms import invert_rigid, transform_points
@@ -170,7 +170,7 @@ class PackedOutfit(Outfit):
             pose_vertices = transform_points(root, torch.from_numpy(vertices)).numpy()
         return BodyFit(
             vertices=vertices,
-            vertex_transforms=_through(transforms, template.vertices.numpy(), vertices),
+            vertex_transforms=_fit_translations(transforms, template.vertices.numpy(), vertices),
             joint_transforms=joint_transforms,
             pose_vertices=pose_vertices,
             translation=stored.get("translation", np.zeros(3, np.float32) if posed is None else posed.translation),
@@ -186,7 +186,7 @@ class PackedOutfit(Outfit):
             skinned = transform_points(torch.from_numpy(self._skin(stored["joint_transforms"])), self.template.vertices)
             check_posed(skinned.numpy(), vertices, "joint_transforms", self.template, path)
         if "vtransf" in stored:
-            check_carried(stored["vtransf"], self.template, vertices, path)
+            check_vertex_transforms(stored["vtransf"], self.template, vertices, path)
 
     def _skin(self, joint_transforms: np.ndarray) -> np.ndarray:
         """Vertex transforms ``(V, 4, 4)`` of joint transforms ``(J, 4, 4)``, both posed_from_canonical."""
@@ -210,7 +210,7 @@ class PackedOutfit(Outfit):
         if "vtransf" not in stored:
             raise DataError(path, "expected vtransf, joint_transforms or pose to place the body, found none of them.")
         template, transforms = self.template, _whole_transforms(stored, path)
-        whole = torch.from_numpy(_through(transforms, template.vertices.numpy(), stored.get("body_verts")))
+        whole = torch.from_numpy(_fit_translations(transforms, template.vertices.numpy(), stored.get("body_verts")))
         bound = template.canonical_from_bind
         from_bind = (whole @ blend_transforms(template.weights, bound[None])[0]).numpy()
         solved = fit_joint_transforms(from_bind, template.weights.numpy(), template.parents)
@@ -249,7 +249,7 @@ def _whole_transforms(stored: dict[str, np.ndarray], path: Path) -> np.ndarray:
     """``vtransf`` as ``(V, 4, 4)``.
 
     Packed files give the rotation block alone, or a translation that leaves out the subject's place in the world;
-    `_through` puts it right where the posed vertices are known.
+    `_fit_translations` puts it right where the posed vertices are known.
     """
     given = stored["vtransf"]
     if given.shape[-1] == 3 and "body_verts" not in stored:
@@ -259,8 +259,8 @@ def _whole_transforms(stored: dict[str, np.ndarray], path: Path) -> np.ndarray:
     return whole
 
 
-def _through(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None) -> np.ndarray:
-    """The transforms with translations that carry each rest vertex exactly to its posed place, where it is known."""
+def _fit_translations(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None) -> np.ndarray:
+    """The transforms with translations that pose each rest vertex exactly, where it is known."""
     if posed is None:
         return transforms
     exact = transforms.copy()
@@ -271,10 +271,8 @@ def _through(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None)
 def _stored_pose(pose: np.ndarray, joint_names: Sequence[str], path: Path) -> np.ndarray:
     """A file's pose as axis-angle of the body's joints ``(J, 3)``.
 
-    Joints of hands and face may be missing from the pose, or from the body: they are at rest then.
-
-    Raises:
-        DataError: for another shape, or rotations of joints that the body lacks.
+    Joints of hands and face may be missing from the pose, or from the body: they are at rest then. Raises `DataError`
+    for another shape, or rotations of joints that the body lacks.
     """
     rows, joints, shared = len(pose) if pose.shape[1:] == (3,) else 0, len(joint_names), len(SMPL_JOINTS)
     if list(joint_names[:shared]) == SMPL_JOINTS and shared <= rows != joints:
@@ -335,8 +333,7 @@ def write_packed_frame(path: Path, frame: Frame) -> None:
 def write_packed_outfit(outfit: Outfit, folder: Path) -> PackedOutfit:
     """Writes all frames of an outfit, of whatever layout, as a packed outfit with template and manifest.
 
-    Raises:
-        DataError: for a frame that is not sound.
+    Raises `DataError` for an invalid frame.
     """
     folder = Path(folder)
     settings = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{outfit.dataset}/{outfit.name}"}

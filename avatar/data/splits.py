@@ -48,11 +48,8 @@ def split_frames(names: Sequence[str], config: SplitConfig) -> Split:
     """Holds back validation frames, then thins the rest; depends on the names alone.
 
     Whole sequences (the name up to its last dot) are held back where there are four or more, because neighbouring
-    frames are nearly copies; otherwise the last stretch of frames is. The fraction keeps evenly spaced frames, and
-    does not change which frames validate.
-
-    Raises:
-        AvatarError: when there are too few frames to share.
+    frames are nearly copies; otherwise the last stretch of frames is. The fraction keeps evenly spaced frames, and does
+    not change which frames validate. Raises `AvatarError` when there are too few frames to share.
     """
     names = sorted(names)
     count = round(len(names) * config.validation_share)
@@ -90,11 +87,7 @@ def _held_sequences(names: Sequence[str], count: int) -> list[str]:
 
 
 def check_leakage(train: Sequence[str], test: Sequence[str], outfit: str) -> None:
-    """Refuses a frame that is both trained and tested on.
-
-    Raises:
-        AvatarError: naming the first such frames.
-    """
+    """Refuses a frame that is both trained and tested on. Raises `AvatarError` naming the first such frames."""
     shared = sorted(set(train) & set(test))
     if shared:
         raise AvatarError(

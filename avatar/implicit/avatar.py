@@ -15,11 +15,8 @@ from avatar.geometry.chunks import in_chunks
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import transform_points
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
-from avatar.implicit.gating import Attention, PoseGate, joint_quaternions
-from avatar.implicit.lattice import FieldLattice
-from avatar.implicit.networks import MlpConfig
-from avatar.implicit.sdf import PosedSdf, SdfConfig
-from avatar.implicit.texture import TextureField
+from avatar.implicit.fields import Attention, FieldLattice, PoseGate, joint_quaternions
+from avatar.implicit.networks import MlpConfig, PosedSdf, SdfConfig, TextureField
 from avatar.records import Mesh, PointCloud, Template
 
 CHUNK = 65_536  # points skinned or coloured at once
@@ -79,7 +76,7 @@ class ImplicitAvatar(nn.Module):
         self.texture = TextureField(inputs, self.sdf.mlp.channels, config.texture) if config.colored else None
 
     def pose_features(self, points: Tensor, joint_transforms: Tensor) -> Tensor:
-        """What each point is told of the pose, ``(B, N, P)``; see `PoseInput`."""
+        """Pose features ``(B, N, P)`` of each point; see `PoseInput`."""
         dims = check_shape("points", points, "B N 3")
         if self.config.pose is PoseInput.none:
             return points.new_zeros(*points.shape[:2], 0)
@@ -103,8 +100,7 @@ class ImplicitAvatar(nn.Module):
     def colors(self, points: Tensor, joint_transforms: Tensor) -> Tensor:
         """Colours ``(B, N, 3)`` in [0, 1] at canonical points; what geometry gives to them is not trained by them.
 
-        Raises:
-            AvatarError: for an avatar without texture.
+        Raises `AvatarError` for an avatar without texture.
         """
         if self.texture is None:
             raise AvatarError("colors: this avatar was trained without texture (method.settings.avatar.colored=true).")
@@ -132,7 +128,7 @@ class ImplicitAvatar(nn.Module):
 
     @torch.no_grad()
     def pose_mesh(self, mesh: Mesh, joint_transforms: Tensor) -> Mesh:
-        """A canonical mesh carried to a pose by forward LBS with the field's weights, global motion included.
+        """A canonical mesh posed by forward LBS with the field's weights, global motion included.
 
         Args:
             mesh: of `canonical_mesh`, or any other in canonical space.
@@ -141,11 +137,11 @@ class ImplicitAvatar(nn.Module):
         vertices = torch.from_numpy(mesh.vertices).to(self.box)
         pose = joint_transforms[None].to(self.box)
 
-        def carry(chunk: slice) -> Tensor:
+        def pose_chunk(chunk: slice) -> Tensor:
             transforms = skin_transforms(self.field(vertices[chunk][None]), pose, self.canonical_from_bind)
             return transform_points(transforms, vertices[chunk][None])[0]
 
-        return replace(mesh, vertices=torch.cat(in_chunks(carry, len(vertices), CHUNK)).cpu().numpy())
+        return replace(mesh, vertices=torch.cat(in_chunks(pose_chunk, len(vertices), CHUNK)).cpu().numpy())
 
     def posed_mesh(self, joint_transforms: Tensor, config: ExtractionConfig | None = None) -> Mesh:
         """The dressed person in a pose, ``(J, 4, 4)`` posed_from_canonical: extracted, then posed."""

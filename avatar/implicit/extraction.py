@@ -64,8 +64,7 @@ def extract_surface(
         box: ``(2, 3)`` lowest and highest corner of the space to look in.
         config: resolution and what is kept.
 
-    Raises:
-        AvatarError: when the field has no zero in the box, or is not finite.
+    Raises `AvatarError` when the field has no zero in the box, or is not finite.
     """
     check_shape("box", box, "2 3")
     config = config or ExtractionConfig()
@@ -89,7 +88,11 @@ def extract_surface(
             f"field: expected a zero between {low.tolist()} and {high.tolist()}, its values there reach from "
             f"{values.min():.3g} to {values.max():.3g} m. Train longer, or check the scans the field was trained on."
         )
-    return Extracted(_march(values, low.cpu().numpy(), step, config.parts), evaluations, values.size)
+    march = require("skimage.measure").marching_cubes
+    vertices, faces, _, _ = march(values, 0.0, gradient_direction="descent")
+    vertices = (vertices * step + low.cpu().numpy()).astype(np.float32)
+    mesh = largest_parts(Mesh(vertices, faces.astype(np.int64)), config.parts)
+    return Extracted(mesh, evaluations, values.size)
 
 
 @torch.no_grad()
@@ -111,15 +114,10 @@ def _evaluate(
     return len(ids)
 
 
-def _corner_views(values: np.ndarray) -> list[np.ndarray]:
-    """The eight corners of all cells, as views of the nodes."""
-    x, y, z = (size - 1 for size in values.shape)
-    return [values[a : a + x, b : b + y, c : c + z] for a, b, c in CORNERS]
-
-
 def _may_hold_zero(values: np.ndarray, slope: float) -> np.ndarray:
     """Cells whose corners differ in sign or are near zero; ``slope`` is the most a value can change over a side."""
-    corners = _corner_views(values)
+    x, y, z = (size - 1 for size in values.shape)
+    corners = [values[a : a + x, b : b + y, c : c + z] for a, b, c in CORNERS]
     inside = sum((corner < 0).astype(np.int8) for corner in corners)
     near = sum(np.abs(corner) for corner in corners) / 8 <= REACH * slope
     return near | ((inside > 0) & (inside < 8))
@@ -144,14 +142,6 @@ def _nodes_within(cells: np.ndarray) -> np.ndarray:
         nodes[a : a + x : 2, b : b + y : 2, c : c + z : 2] |= cells
     nodes[::2, ::2, ::2] = False
     return nodes
-
-
-def _march(values: np.ndarray, low: np.ndarray, step: float, parts: int) -> Mesh:
-    """Marching cubes on node values, and the largest parts of what it gives."""
-    measure = require("skimage.measure")
-    vertices, faces, _, _ = measure.marching_cubes(values, 0.0, gradient_direction="descent")
-    vertices = (vertices * step + low).astype(np.float32)
-    return largest_parts(Mesh(vertices, faces.astype(np.int64)), parts)
 
 
 def largest_parts(mesh: Mesh, parts: int) -> Mesh:

@@ -1,4 +1,4 @@
-"""The network that geometry and colour share: Fourier features, and a weight-normalised MLP that sees them twice."""
+"""SCANimate's networks: an MLP on Fourier features, the pose-aware signed distance (eq. 18) and the texture (A.3)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrizations import weight_norm
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, check_shape
 from avatar.geometry.precision import full_precision
 
 
@@ -89,3 +89,70 @@ def fourier_features(points: Tensor, orders: int) -> Tensor:
     """``(..., 3)`` to ``(..., 3 (1 + 2 orders))``: the points, then sin and cos of 2^k of them (NeRF, without pi)."""
     waves = [wave(2**order * points) for order in range(orders) for wave in (torch.sin, torch.cos)]
     return torch.cat([points, *waves], dim=-1)
+
+
+@dataclass
+class SdfConfig(MlpConfig):
+    """The signed distance network; the defaults are the paper's."""
+
+    radius: float = 0.5  # of the sphere it starts as, in halves of the box's longest side
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0 < self.radius < 1:
+            raise AvatarError(f"radius: expected between 0 and 1, got {self.radius}.")
+
+
+class PosedSdf(nn.Module):
+    """Distance to the dressed surface in canonical space, negative inside, metres, for a pose.
+
+    Inside, the box is centred and shrunk as a whole to [-1, 1], never stretched, so the network's gradient is that
+    of the distance in metres.
+    """
+
+    def __init__(self, pose_channels: int, box: Tensor, config: SdfConfig):
+        """Builds the network as a sphere in its box.
+
+        Args:
+            pose_channels: width of the pose features; 0 for a surface that no pose moves.
+            box: ``(2, 3)`` lowest and highest corner of the space it is about, metres.
+            config: size of the network.
+        """
+        super().__init__()
+        check_shape("box", box, "2 3")
+        self.config, self.pose_channels = config, pose_channels
+        self.register_buffer("centre", box.mean(dim=0))
+        self.register_buffer("scale", (box[1] - box[0]).max() / 2)
+        self.mlp = SkipMlp(3 * (1 + 2 * config.orders) + pose_channels, 1, config)
+        self.mlp.start_as_sphere(config.radius)
+
+    def inputs(self, points: Tensor, pose: Tensor) -> Tensor:
+        """What the network sees of points ``(B, N, 3)`` with pose features ``(B, N, P)``."""
+        dims = check_shape("points", points, "B N 3")
+        check_shape("pose", pose, "B N P", P=self.pose_channels, **dims)
+        waves = fourier_features((points - self.centre) / self.scale, self.config.orders)
+        return torch.cat([waves, pose], dim=-1)
+
+    def features(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Features of the last hidden layer, which the texture field sees: ``(B, N, C)``."""
+        return self.mlp.features(self.inputs(points, pose))
+
+    def forward(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Signed distances ``(B, N)``, metres, of points ``(B, N, 3)`` with pose features ``(B, N, P)``."""
+        return self.mlp(self.inputs(points, pose)).squeeze(-1) * self.scale
+
+
+class TextureField(nn.Module):
+    """Colour of a point from what the signed distance network sees of it and the features it makes of that."""
+
+    def __init__(self, inputs: int, features: int, config: MlpConfig):
+        """Builds the network for ``inputs`` input channels and ``features`` geometry features."""
+        super().__init__()
+        self.inputs, self.channels = inputs, features
+        self.mlp = SkipMlp(inputs + features, 3, config)
+
+    def forward(self, inputs: Tensor, features: Tensor) -> Tensor:
+        """Colours ``(B, N, 3)`` in [0, 1] of ``PosedSdf.inputs`` ``(B, N, I)`` and ``.features`` ``(B, N, C)``."""
+        dims = check_shape("inputs", inputs, "B N I", I=self.inputs)
+        check_shape("features", features, "B N C", B=dims["B"], N=dims["N"], C=self.channels)
+        return torch.sigmoid(self.mlp(torch.cat([inputs, features], dim=-1)))

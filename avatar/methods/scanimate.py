@@ -12,17 +12,24 @@ from torch import Tensor
 
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
 from avatar.checks import AvatarError, DataError
-from avatar.data.canonical_batches import CanonicalBatch, CanonicalFrame, CanonicalFrames, canonical_frame
+from avatar.data.batches import LruSequence
+from avatar.data.canonical_frames import CanonicalBatch, CanonicalFrame, CanonicalFrames, canonical_frame
 from avatar.data.mirroring import mirror_map
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
-from avatar.data.streaming import LruSequence
 from avatar.environment import choose_device
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig, sample_mesh
-from avatar.implicit.body_field import BodyField
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.implicit.losses import TERMS, ImplicitLossConfig, implicit_loss
-from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
+from avatar.implicit.fields import BodyField
+from avatar.implicit.losses import (
+    TERMS,
+    ImplicitLossConfig,
+    QueryConfig,
+    QueryPoints,
+    implicit_loss,
+    query_field,
+    sample_queries,
+)
 from avatar.methods.base import CANONICALIZER, SEED_STRIDE, Inputs, Method, Position, Stage, Task, TrainedAvatar
 from avatar.methods.canonicalizer import canonical_outfits, canonicalizer_folder, find_field
 from avatar.methods.points import check_count
@@ -39,7 +46,7 @@ BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that n
 class ImplicitTrainConfig:
     """What training an implicit avatar has besides its budget (`TrainConfig`)."""
 
-    probes: ProbeConfig = field(default_factory=ProbeConfig)
+    probes: QueryConfig = field(default_factory=QueryConfig)
     loss: ImplicitLossConfig = field(default_factory=ImplicitLossConfig)
     decay: float = 0.1  # factor on the learning rate, on top of train.schedule, at each of
     decay_at: tuple[float, ...] = (0.5, 0.75)  # these shares of training (the paper's)
@@ -92,22 +99,22 @@ class ImplicitTask(Task):
         """The learning rate's factor: warm-up, the schedule's and the decays that are past."""
         return self.config.rate_factor(step, progress) * self.settings.rate_factor(progress)
 
-    def inputs_at(self, step: int) -> tuple[CanonicalBatch, SpacePoints]:
+    def inputs_at(self, step: int) -> tuple[CanonicalBatch, QueryPoints]:
         batch = self.data.batch_at(step, self.config.batch)
         return batch, self.space_at(batch, step)
 
-    def held_back(self) -> Iterator[tuple[CanonicalBatch, SpacePoints]]:
+    def held_back(self) -> Iterator[tuple[CanonicalBatch, QueryPoints]]:
         for batch in self.checks.ordered() if self.checks else ():
             yield batch, self.space_at(batch, -1)
 
-    def space_at(self, batch: CanonicalBatch, key: int) -> SpacePoints:
+    def space_at(self, batch: CanonicalBatch, key: int) -> QueryPoints:
         """The points in space that a key draws for a batch on the CPU."""
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key + 1)
-        return space_points(batch.points, self.body, self.box, self.settings.probes, generator)
+        return sample_queries(batch.points, self.body, self.box, self.settings.probes, generator)
 
     def loss(self, inputs: Inputs, position: Position) -> LossTerms:
         batch, space = inputs
-        values = probe_field(self.model, batch.points, space, batch.joint_transforms)
+        values = query_field(self.model, batch.points, space, batch.joint_transforms)
         return implicit_loss(values, batch.normals, self.settings.loss, batch.colors)
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avatar.canonical.baselines import SkinningSource
-from avatar.canonical.scans import canonicalize_scan
+from avatar.canonical.scans import SkinningSource, canonicalize_scan
 from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset
 from avatar.environment import prepared_process

@@ -8,13 +8,11 @@ from pathlib import Path
 import torch
 
 from avatar.body.packed import write_template
-from avatar.canonical.baselines import KNN, NearestBody, SkinningSource
 from avatar.canonical.canonicalizer import Canonicalizer
 from avatar.canonical.posed import prepare_scan
-from avatar.canonical.scans import canonicalize_scan
+from avatar.canonical.scans import KNN, NearestBody, SkinningSource, canonicalize_scan
 from avatar.checks import DataError
-from avatar.data.batches import FrameDataset
-from avatar.data.streaming import LruSequence
+from avatar.data.batches import FrameDataset, LruSequence
 from avatar.data.validation import check_frame_count
 from avatar.environment import choose_device, prepared_process
 from avatar.io.canonical_scans import write_canonical_scan
@@ -38,7 +36,7 @@ from avatar.training.trainer import Trainer, spent
 from avatar.world import require_single_process
 
 # What makes canonical scans of trained weights, beside this module; how these were trained shows in the weights.
-SOURCE = ("avatar.canonical.scans", "avatar.canonical.baselines", "avatar.methods.canonicalizer", "avatar.data.layouts")
+SOURCE = ("avatar.canonical.scans", "avatar.methods.canonicalizer", "avatar.data.layouts")
 
 
 @prepared_process()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from avatar.body.atlas import flatten_disc, number_corners, patches_without_uv, quad_corners, toeless_atlas
+from avatar.body.anny import flatten_disc, number_corners, patches_without_uv, quad_corners, toeless_atlas
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 

@@ -17,10 +17,9 @@ import scipy.sparse
 import torch
 from bodies import distinct, random_model, write_unwrapped
 
-from avatar.body.convert import convert_body_model
 from avatar.body.open import open_body
 from avatar.body.packed import packed_body, write_template
-from avatar.body.smpl import joint_tree, smpl_body
+from avatar.body.smpl import convert_body_model, joint_tree, smpl_body
 from avatar.checks import AvatarError, DataError
 from avatar.nn.atlas import Atlas
 from avatar.plain_verbs import convert_body

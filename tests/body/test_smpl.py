@@ -6,9 +6,8 @@ import torch
 from bodies import RandomModel, random_model, random_pose
 from smplx.lbs import lbs
 
-from avatar.body.convert import convert_body_model
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
-from avatar.body.smpl import joint_tree, smpl_body
+from avatar.body.smpl import convert_body_model, joint_tree, smpl_body
 from avatar.checks import AvatarError, DataError
 
 KINDS = {"smpl": 24, "smplh": 52, "smplx": 55}

@@ -7,8 +7,7 @@ import pytest
 import torch
 from limbs import arm_frame, arm_template, true_weights
 
-from avatar.canonical.baselines import KNN, NearestBody
-from avatar.canonical.scans import canonicalize_scan, cut_stretched, edge_stretch
+from avatar.canonical.scans import KNN, NearestBody, canonicalize_scan, cut_stretched, edge_stretch
 from avatar.checks import AvatarError
 from avatar.records import Scan
 

@@ -8,9 +8,16 @@ import torch
 from limbs import RADIUS, SLEEVE, arm_frame, arm_template
 
 from avatar.body.skinning import chain_transforms, skin_transforms
-from avatar.canonical.edges import CONCAVE, mean_curvature, smooth_edges
 from avatar.canonical.fields import bounding_box
-from avatar.canonical.posed import DrawConfig, draw_batch, local_pose, prepare_scan
+from avatar.canonical.posed import (
+    CONCAVE,
+    DrawConfig,
+    draw_batch,
+    local_pose,
+    mean_curvature,
+    prepare_scan,
+    smooth_edges,
+)
 from avatar.geometry.transforms import assemble_transform, rotation_from_axis_angle, transform_points
 from avatar.records import BodyFit, Scan
 

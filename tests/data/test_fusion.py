@@ -7,9 +7,8 @@ import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from avatar.data.fusion import fuse_mesh, fused_noise, rim_partners, split_faces, split_long_edges, weld_contacts
-from avatar.data.patterns import Pattern
-from avatar.data.scanner import DressedSurface, ScanConfig, scan_mesh
+from avatar.data.fusion import boundary_partners, fuse_mesh, fused_noise, split_faces, split_long_edges, weld_contacts
+from avatar.data.scanner import DressedSurface, Pattern, ScanConfig, scan_mesh
 from avatar.records import Scan
 
 
@@ -131,13 +130,16 @@ def test_sheets_apart_or_back_to_back_keep_their_inside(gap, lower, upper):
 
 def test_rims_look_for_another_surface_only():
     near = two_sheets(0.008, lower=-1, upper=1)
-    looking, partner = rim_partners(near, 0.012)
+    looking, partner = boundary_partners(near, 0.012)
     assert len(looking) == 2 * 80  # the whole border of both
     np.testing.assert_array_equal(near.labels[looking] != near.labels[partner], True)
     np.testing.assert_allclose(np.linalg.norm(near.points[looking] - near.points[partner], axis=1), 0.008, atol=1e-6)
     alike = Scan(near.points, near.normals, near.faces, np.ones_like(near.labels), near.points)
-    assert len(rim_partners(alike, 0.012)[0]) == 0  # neighbours at rest are no other surface
-    assert len(rim_partners(Scan(near.points, near.normals, near.faces, alike.labels, near.canonical), 0.012)[0]) == 160
+    assert len(boundary_partners(alike, 0.012)[0]) == 0  # neighbours at rest are no other surface
+    assert (
+        len(boundary_partners(Scan(near.points, near.normals, near.faces, alike.labels, near.canonical), 0.012)[0])
+        == 160
+    )
 
 
 def test_noise_has_the_size_asked_for_and_is_alike_at_neighbours():
@@ -172,7 +174,7 @@ def test_a_raw_mesh_is_fine_noisy_holed_and_repeatable():
 
 
 def test_an_outfit_is_scanned_as_a_mesh_where_asked(tiny_folder):
-    from avatar.data.open_layout import OpenOutfit
+    from avatar.data.layouts import OpenOutfit
 
     outfit = OpenOutfit(tiny_folder, "open", ScanConfig(mesh=True, merge=0.012, noise=0.001))
     scan = outfit.load("train", "rise.00003").scan

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from avatar.body.open import open_body
 from avatar.body.packed import write_body, write_template
 from avatar.checks import AvatarError, DataError
-from avatar.data.layouts import find_outfit, open_outfit_folder
-from avatar.data.open_layout import OpenOutfit
+from avatar.data.layouts import OpenOutfit, find_outfit, open_outfit_folder
 from avatar.data.outfits import outfit_folder
 from avatar.data.packed_layout import PackedOutfit, fit_joint_transforms, write_packed_frame, write_packed_outfit
 from avatar.data.scanner import ScanConfig

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from avatar.checks import AvatarError
-from avatar.data.open_layout import OpenOutfit
-from avatar.data.patterns import CHECK, PALETTES, SKIN, SPACING, STRIPE, Pattern, paint, pattern_colors
-from avatar.data.scanner import ScanConfig
+from avatar.data.layouts import OpenOutfit
+from avatar.data.scanner import CHECK, PALETTES, SKIN, SPACING, STRIPE, Pattern, ScanConfig, paint, pattern_colors
 from avatar.records import Scan
 
 GROUND, FIGURE = PALETTES[0]

@@ -11,10 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError
-from avatar.data.alignment import measure_overlap, suggest_hint
 from avatar.data.layouts import find_outfit
 from avatar.data.scanner import SCANNERS
-from avatar.data.validation import check_frame, check_frame_count, check_pose, check_template
+from avatar.data.validation import (
+    check_frame,
+    check_frame_count,
+    check_pose,
+    check_template,
+    measure_overlap,
+    suggest_hint,
+)
 from avatar.geometry.surface import vertex_normals
 from avatar.records import BodyFit, Frame, Scan
 

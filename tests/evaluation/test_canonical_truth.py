@@ -9,7 +9,7 @@ import torch
 
 from avatar.body.skinning import chain_transforms, skin_transforms
 from avatar.checks import AvatarError
-from avatar.data.open_layout import OpenOutfit
+from avatar.data.layouts import OpenOutfit
 from avatar.data.scanner import ScanConfig
 from avatar.evaluation.canonical_scores import (
     CANONICAL_METRICS,

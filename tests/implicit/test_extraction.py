@@ -7,7 +7,7 @@ import trimesh
 
 from avatar.checks import AvatarError
 from avatar.implicit.extraction import REACH, ExtractionConfig, extract_surface, largest_parts
-from avatar.implicit.sdf import PosedSdf, SdfConfig
+from avatar.implicit.networks import PosedSdf, SdfConfig
 from avatar.records import Mesh
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])

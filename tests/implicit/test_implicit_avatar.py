@@ -10,11 +10,10 @@ from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig, PoseInput, sample_mesh
-from avatar.implicit.body_field import BodyField
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.implicit.networks import MlpConfig
-from avatar.implicit.probing import SpacePoints, probe_field
-from avatar.implicit.sdf import SdfConfig
+from avatar.implicit.fields import BodyField
+from avatar.implicit.losses import QueryPoints, query_field
+from avatar.implicit.networks import MlpConfig, SdfConfig
 from avatar.records import Mesh
 
 BODY = open_body("female")
@@ -86,7 +85,7 @@ def test_gradients_see_what_the_gate_changes_from_place_to_place():
     avatar, pose, step = make_avatar(gate_spacing=0.3).double(), WRIST.double(), 1e-6
     arm = TEMPLATE.weights[:, SMPL_JOINTS.index("left_elbow")] > 0.9
     points = TEMPLATE.vertices[arm][::100][None].double() + 0.012
-    found = probe_field(avatar, points, SpacePoints(*[points[:, :1]] * 3), pose).surface_gradients
+    found = query_field(avatar, points, QueryPoints(*[points[:, :1]] * 3), pose).surface_gradients
     shifts = step * torch.eye(3, dtype=torch.float64)
     slopes = [(avatar(points + shift, pose) - avatar(points - shift, pose)) / (2 * step) for shift in shifts]
     torch.testing.assert_close(found, torch.stack(slopes, dim=-1), atol=1e-6, rtol=1e-5)

@@ -27,7 +27,7 @@ def test_a_true_distance_loses_nothing_but_what_empty_space_costs():
     raw = implicit_loss(values, normals, ImplicitLossConfig()).raw
     for name in ("surface", "normal", "eikonal", "box"):
         assert raw[name].item() == pytest.approx(0, abs=1e-6)
-    assert raw["off_surface"].item() == pytest.approx(torch.exp(-100 * values.empty.abs()).mean().item())
+    assert raw["off_surface"].item() == pytest.approx(torch.exp(-100 * values.uniform.abs()).mean().item())
 
 
 def test_each_term_is_its_equation():
@@ -46,7 +46,7 @@ def test_each_term_is_its_equation():
 def test_the_eikonal_term_is_over_surface_and_space_alike():
     values, normals = sphere_values()
     doubled = FieldValues(
-        values.surface, values.surface_gradients, 2 * values.space_gradients, values.empty, values.rim
+        values.surface, values.surface_gradients, 2 * values.space_gradients, values.uniform, values.boundary
     )
     raw = implicit_loss(doubled, normals, ImplicitLossConfig()).raw
     assert raw["eikonal"].item() == pytest.approx(80 / 140, rel=1e-5)
@@ -54,7 +54,7 @@ def test_the_eikonal_term_is_over_surface_and_space_alike():
 
 def test_off_surface_falls_with_distance_on_either_side():
     values, normals = sphere_values()
-    near = replace(values, empty=torch.tensor([[0.01, -0.01]] * 2))
+    near = replace(values, uniform=torch.tensor([[0.01, -0.01]] * 2))
     raw = implicit_loss(near, normals, ImplicitLossConfig(sharpness=50)).raw
     assert raw["off_surface"].item() == pytest.approx(torch.exp(torch.tensor(-0.5)).item())
 

@@ -6,8 +6,7 @@ import torch
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
-from avatar.implicit.body_field import BodyField
-from avatar.implicit.lattice import FieldLattice
+from avatar.implicit.fields import BodyField, FieldLattice
 
 BOX = torch.tensor([[-0.5, 0.0, -0.2], [0.5, 0.73, 0.3]])
 

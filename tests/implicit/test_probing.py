@@ -6,11 +6,16 @@ from spheres import sphere_template
 
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig
-from avatar.implicit.body_field import BodyField
-from avatar.implicit.losses import ImplicitLossConfig, implicit_loss
-from avatar.implicit.networks import MlpConfig
-from avatar.implicit.probing import ProbeConfig, SpacePoints, probe_field, space_points
-from avatar.implicit.sdf import SdfConfig
+from avatar.implicit.fields import BodyField
+from avatar.implicit.losses import (
+    ImplicitLossConfig,
+    QueryConfig,
+    QueryPoints,
+    implicit_loss,
+    query_field,
+    sample_queries,
+)
+from avatar.implicit.networks import MlpConfig, SdfConfig
 
 TEMPLATE = sphere_template(2)  # a unit sphere skinned to one joint
 BOX = torch.tensor([[-1.5, -1.4, -1.3], [1.5, 1.4, 1.3]])
@@ -26,13 +31,15 @@ def make_avatar(**switches):
 
 def draw(seed=0, **counts):
     scan = torch.nn.functional.normalize(torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(9)), dim=-1)
-    config = ProbeConfig(**({"near_points": 400, "box_points": 300, "rim_points": 200, "near_distance": 0.1} | counts))
-    return scan, space_points(scan, 10 + TEMPLATE.vertices, BOX, config, torch.Generator().manual_seed(seed))
+    config = QueryConfig(**({"near_points": 400, "box_points": 300, "rim_points": 200, "near_distance": 0.1} | counts))
+    return scan, sample_queries(scan, 10 + TEMPLATE.vertices, BOX, config, torch.Generator().manual_seed(seed))
 
 
 def test_points_lie_where_they_are_said_to():
     scan, space = draw()
-    assert space.near.shape == (2, 400, 3) and space.empty.shape == (2, 300, 3) and space.rim.shape == (2, 200, 3)
+    assert (
+        space.near.shape == (2, 400, 3) and space.uniform.shape == (2, 300, 3) and space.boundary.shape == (2, 200, 3)
+    )
     about_scan, about_body = space.near[:, :200], space.near[:, 200:] - 10
     assert (about_scan.norm(dim=-1) - 1).abs().mean() < 0.12
     assert (about_body.norm(dim=-1) - 1).abs().mean() < 0.12
@@ -41,27 +48,27 @@ def test_points_lie_where_they_are_said_to():
     _, still = draw(near_distance=1e-9)  # the same draw unshaken
     shaken = (space.near - still.near) / 0.1
     assert shaken.mean().abs() < 0.1 and float(shaken.std()) == pytest.approx(1, abs=0.1)
-    for points in (space.empty, space.rim):
+    for points in (space.uniform, space.boundary):
         assert (points >= BOX[0]).all() and (points <= BOX[1]).all()
-    assert (space.empty.amax(dim=1) > 0.9 * BOX[1]).all() and (space.empty.amin(dim=1) < 0.9 * BOX[0]).all()
-    on_side = ((space.rim == BOX[0]) | (space.rim == BOX[1])).sum(dim=-1)
+    assert (space.uniform.amax(dim=1) > 0.9 * BOX[1]).all() and (space.uniform.amin(dim=1) < 0.9 * BOX[0]).all()
+    on_side = ((space.boundary == BOX[0]) | (space.boundary == BOX[1])).sum(dim=-1)
     assert (on_side == 1).all()
     for axis in range(3):
         for side in range(2):
-            assert (space.rim[..., axis] == BOX[side, axis]).any()
+            assert (space.boundary[..., axis] == BOX[side, axis]).any()
 
 
 def test_the_same_state_draws_the_same_points_and_another_draws_others():
     one, two, other = draw(0)[1], draw(0)[1], draw(1)[1]
-    assert torch.equal(one.near, two.near) and torch.equal(one.rim, two.rim)
-    assert not torch.equal(one.empty, other.empty)
+    assert torch.equal(one.near, two.near) and torch.equal(one.boundary, two.boundary)
+    assert not torch.equal(one.uniform, other.uniform)
 
 
 def test_gradients_are_those_of_the_whole_field():
     avatar = make_avatar().double()
     generator = torch.Generator().manual_seed(0)
     places = [torch.randn(1, count, 3, generator=generator, dtype=torch.float64) for count in (5, 4, 3, 2)]
-    values = probe_field(avatar, places[0], SpacePoints(*places[1:]), POSE.double())
+    values = query_field(avatar, places[0], QueryPoints(*places[1:]), POSE.double())
     found = torch.cat([values.surface_gradients, values.space_gradients], dim=1)
     points, step = torch.cat(places[:3], dim=1), 1e-5
     for axis in range(3):
@@ -69,17 +76,17 @@ def test_gradients_are_those_of_the_whole_field():
         shift[axis] = step
         slope = (avatar(points + shift, POSE.double()) - avatar(points - shift, POSE.double())) / (2 * step)
         torch.testing.assert_close(found[..., axis], slope, atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(values.rim, avatar(places[3], POSE.double()))
-    torch.testing.assert_close(values.empty, avatar(places[2], POSE.double()))
+    torch.testing.assert_close(values.boundary, avatar(places[3], POSE.double()))
+    torch.testing.assert_close(values.uniform, avatar(places[2], POSE.double()))
 
 
 def test_validation_leaves_no_graph_and_sees_the_same():
     avatar = make_avatar()
     scan, space = draw()
     pose = POSE.expand(2, 1, 4, 4)
-    learning = probe_field(avatar, scan, space, pose)
+    learning = query_field(avatar, scan, space, pose)
     with torch.no_grad():
-        looking = probe_field(avatar, scan, space, pose)
+        looking = query_field(avatar, scan, space, pose)
     assert learning.surface_gradients.requires_grad and not looking.surface_gradients.requires_grad
     assert not looking.surface.requires_grad
     torch.testing.assert_close(looking.space_gradients, learning.space_gradients.detach())
@@ -90,14 +97,14 @@ def learn(loss: ImplicitLossConfig, steps=90, **switches):
     avatar = make_avatar(**switches)
     optimiser = torch.optim.Adam([p for p in avatar.parameters() if p.requires_grad], lr=5e-3)
     generator = torch.Generator().manual_seed(0)
-    config = ProbeConfig(near_points=200, box_points=150, rim_points=60, near_distance=0.15)
+    config = QueryConfig(near_points=200, box_points=150, rim_points=60, near_distance=0.15)
     for _ in range(steps):
         normals = torch.nn.functional.normalize(torch.randn(1, 200, 3, generator=generator), dim=-1)
         normals = torch.where(normals[..., 1:2] < -0.3, -normals, normals)
         scan = 0.7 * normals
-        space = space_points(scan, 0.7 * TEMPLATE.vertices, BOX, config, generator)
+        space = sample_queries(scan, 0.7 * TEMPLATE.vertices, BOX, config, generator)
         colors = torch.tensor([0.9, 0.2, 0.1]).expand_as(scan)
-        terms = implicit_loss(probe_field(avatar, scan, space, POSE), normals, loss, colors)
+        terms = implicit_loss(query_field(avatar, scan, space, POSE), normals, loss, colors)
         optimiser.zero_grad()
         terms.total.backward()
         optimiser.step()
@@ -109,9 +116,9 @@ def errors(avatar) -> dict[str, float]:
     generator = torch.Generator().manual_seed(5)
     normals = torch.nn.functional.normalize(torch.randn(1, 500, 3, generator=generator), dim=-1)
     normals[..., 1] = normals[..., 1].abs()
-    space = space_points(0.7 * normals, TEMPLATE.vertices, BOX, ProbeConfig(400, 0.2, 400, 200), generator)
+    space = sample_queries(0.7 * normals, TEMPLATE.vertices, BOX, QueryConfig(400, 0.2, 400, 200), generator)
     with torch.no_grad():
-        values = probe_field(avatar, 0.7 * normals, space, POSE)
+        values = query_field(avatar, 0.7 * normals, space, POSE)
         return {name: value.item() for name, value in implicit_loss(values, normals, ImplicitLossConfig()).raw.items()}
 
 
@@ -148,6 +155,6 @@ def test_colours_are_learned_and_leave_the_geometry_alone():
 
 def test_bad_counts_are_refused():
     with pytest.raises(AvatarError, match="near_points"):
-        ProbeConfig(near_points=0)
+        QueryConfig(near_points=0)
     with pytest.raises(AvatarError, match="near_distance"):
-        ProbeConfig(near_distance=0.0)
+        QueryConfig(near_distance=0.0)

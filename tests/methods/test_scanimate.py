@@ -7,13 +7,12 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from avatar.canonical.baselines import NearestBody
-from avatar.canonical.scans import canonicalize_scan
+from avatar.canonical.scans import NearestBody, canonicalize_scan
 from avatar.checks import AvatarError, DataError
-from avatar.data.canonical_batches import CanonicalFrames, canonical_frame
+from avatar.data.canonical_frames import CanonicalFrames, canonical_frame
 from avatar.data.splits import SplitConfig
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.implicit.probing import ProbeConfig
+from avatar.implicit.losses import QueryConfig
 from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.checkpoints import load_checkpoint
 from avatar.io.meshes import read_mesh
@@ -162,7 +161,7 @@ def make_trainer(trained, tiny_outfit, tmp_path, frames):
     def make(settings: ImplicitTrainConfig | None = None, **options) -> Trainer:
         avatar = load_avatar(trained)
         train = replace(avatar.config.train, schedule=Schedule.constant, **options)
-        probes = ProbeConfig(near_points=60, box_points=20, rim_points=20)
+        probes = QueryConfig(near_points=60, box_points=20, rim_points=20)
         settings = replace(settings or ImplicitTrainConfig(), probes=probes)
         data = CanonicalFrames(frames, 50, seed=3)
         task = ImplicitTask(avatar.model, tiny_outfit.template.vertices, train, settings, data)

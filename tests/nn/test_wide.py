@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from avatar.body.open import open_body
 from avatar.canonical.fields import SkinningField, SkinningFieldConfig
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.implicit.sdf import PosedSdf, SdfConfig
+from avatar.implicit.networks import PosedSdf, SdfConfig
 from avatar.methods.closet import ClosetAvatar, ClosetConfig, PoseLocality
 from avatar.methods.pop import PopAvatar, PopConfig
 from avatar.methods.scale import PointNetConfig, PoseFeature, ScaleAvatar, ScaleConfig

@@ -10,8 +10,7 @@ import torch
 from torch import nn
 
 from avatar.data.batches import FrameDataset, name_frames
-from avatar.data.layouts import find_outfit
-from avatar.data.open_layout import OpenOutfit
+from avatar.data.layouts import OpenOutfit, find_outfit
 from avatar.methods.points import PointTask, draw_samples, predict
 from avatar.methods.registry import find_method
 from avatar.methods.settings import TrainConfig

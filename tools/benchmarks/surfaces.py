@@ -14,7 +14,7 @@ from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig
 from avatar.canonical.posed import prepare_scan
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
-from avatar.implicit.sdf import PosedSdf, SdfConfig
+from avatar.implicit.networks import PosedSdf, SdfConfig
 from avatar.methods.canonicalizer import CanonicalizerTask, CycleConfig
 from avatar.records import Mesh, PointCloud
 from avatar.settings import settings_from_dict

@@ -17,8 +17,8 @@ import torch
 from safetensors.torch import save as pack_tensors
 from scipy.sparse import csc_matrix
 
-from avatar.body.convert import convert_body_model
 from avatar.body.packed import packed_body
+from avatar.body.smpl import convert_body_model
 from avatar.checks import AvatarError, require
 from avatar.io.bvh import read_bvh
 from avatar.io.checkpoints import load_checkpoint, read_weights

@@ -17,9 +17,8 @@ import numpy as np
 import torch
 import yaml
 
-from avatar.body.convert import convert_body_model
 from avatar.body.packed import packed_body
-from avatar.body.smpl import joint_tree, smpl_body
+from avatar.body.smpl import convert_body_model, joint_tree, smpl_body
 from avatar.io.bvh import read_bvh
 from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.checkpoints import load_checkpoint, read_weights, save_checkpoint, write_weights

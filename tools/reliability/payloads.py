@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from avatar.body.convert import convert_body_model
+from avatar.body.smpl import convert_body_model
 from avatar.checks import AvatarError
 from avatar.data.layouts import open_outfit_folder
 from avatar.io.checkpoints import load_checkpoint, read_weights

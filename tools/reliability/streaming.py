@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from avatar.body.packed import write_body
-from avatar.data.open_layout import OpenOutfit
+from avatar.data.batches import bytes_of
+from avatar.data.layouts import OpenOutfit
 from avatar.data.packed_layout import PackedOutfit, write_packed_frame
 from avatar.data.scanner import ScanConfig
-from avatar.data.streaming import bytes_of
 from avatar.io.npz import write_whole
 from avatar.runs.training import train
 from reliability.findings import Finding
