@@ -27,7 +27,7 @@ from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
-from avatar.implicit.body_field import BodyField
+from avatar.implicit.fields import BodyField
 from avatar.invocation import command_line
 from avatar.io.building import building
 from avatar.io.checkpoints import read_weights
