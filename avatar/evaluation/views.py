@@ -37,21 +37,22 @@ def render_normals(points: Tensor, normals: Tensor, radius: float, center: Tenso
     pixel = extent / PIXELS
     reach = int(np.ceil(radius / pixel))
     steps = torch.arange(-reach, reach + 1)
-    around = torch.stack(torch.meshgrid(steps, steps, indexing="ij"), dim=-1).reshape(-1, 2)
+    across, up = (steps.flatten() for steps in torch.meshgrid(steps, steps, indexing="xy"))
     maps = torch.zeros(len(AZIMUTHS), PIXELS * PIXELS, 3, dtype=points.dtype)
     for image, axes in zip(maps, view_axes()):
-        seen, facing = (points - center) @ axes.T, normals @ axes.T
-        cell = (seen[:, :2] / pixel + PIXELS / 2).floor()
-        cells = cell[:, None] + around
-        aside = (cells + 0.5 - PIXELS / 2) * pixel - seen[:, None, :2]
-        slope = torch.where(facing[:, 2:].abs() < EDGE_ON, torch.inf, -1 / facing[:, 2:])
-        depth = (aside * facing[:, None, :2]).sum(dim=-1) * slope  # of the disc's plane, over its middle
-        away = (aside.square().sum(dim=-1) + depth.square()).sqrt()
-        hit = away <= radius
-        hit &= ((cells >= 0) & (cells < PIXELS)).all(dim=-1)
-        disc, corner = hit.nonzero(as_tuple=True)
-        column, row = cells[disc, corner].long().unbind(dim=-1)
-        order = (seen[disc, 2] + depth[disc, corner] - away[disc, corner]).argsort()
+        x, y, z = ((points - center) @ axes.T).float().T
+        facing = (normals @ axes.T).float()
+        slope = torch.where(facing[:, 2:].abs() < EDGE_ON, torch.inf, -facing[:, :2] / facing[:, 2:])
+        column, row = ((place / pixel + PIXELS / 2).floor().long() for place in (x, y))
+        right = ((column + 0.5 - PIXELS / 2) * pixel - x)[:, None] + across * pixel  # from the middle to each pixel
+        above = ((row + 0.5 - PIXELS / 2) * pixel - y)[:, None] + up * pixel
+        depth = slope[:, :1] * right + slope[:, 1:] * above  # of the disc's plane
+        away = right.square() + above.square() + depth.square()
+        disc, step = (away <= radius**2).nonzero(as_tuple=True)
+        column, row = column[disc] + across[step], row[disc] + up[step]
+        inside = (column >= 0) & (column < PIXELS) & (row >= 0) & (row < PIXELS)
+        disc, step, column, row = (values[inside] for values in (disc, step, column, row))
+        order = (z[disc] + depth[disc, step] - away[disc, step].sqrt()).argsort()
         front = np.full(PIXELS * PIXELS, -1)
         front[(row * PIXELS + column)[order].numpy()] = disc[order].numpy()  # the last, nearest one stays
         filled = torch.from_numpy(front >= 0)
