@@ -21,7 +21,7 @@ from avatar.io.documents import read_yaml
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Scan, Template
 
-SPLITS = ("train", "test")
+SPLITS = ("train", "test", "interpolation")  # interpolation: unseen poses of the kind that train has
 VALIDATION = "validation"  # training frames that a run held back: a split of `Outfit.with_validation`
 SAMPLE_FOLDER = Path(__file__).parents[1] / "assets" / "sample"
 OUTFIT_FORMAT = "outfit/1"
@@ -56,7 +56,7 @@ class Outfit(ABC):
         """Names of the frames of a split, sorted.
 
         Raises:
-            AvatarError: for a split other than train and test, and validation where frames are held back.
+            AvatarError: for a split that is not in `SPLITS`, nor validation where frames are held back.
             DataError: when the split's folder is missing or empty.
         """
         if split == VALIDATION and self.held_back:
@@ -64,7 +64,9 @@ class Outfit(ABC):
         if split not in SPLITS:
             held = ", or validation where frames were held back from training" if split == VALIDATION else ""
             near = did_you_mean(split, (*SPLITS, VALIDATION))
-            raise AvatarError(sentences(f"split: expected train or test{held}, got {split!r}.", near))
+            raise AvatarError(
+                sentences(f"split: expected {', '.join(SPLITS[:-1])} or {SPLITS[-1]}{held}, got {split!r}.", near)
+            )
         return self._listed[split] or self._refuse_empty(split)
 
     def has_frames(self, split: str) -> bool:

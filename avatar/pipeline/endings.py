@@ -13,7 +13,7 @@ from avatar.progress import WORK, in_words
 from avatar.values import option
 
 RESUMED = ("simulate", "canonicalize", "train", "predict", "evaluate", "mesh", "experiment")  # skip what is finished
-SPLITS = ("train", "test", "validation")
+SPLITS = ("train", "test", "interpolation", "validation")
 report = logging.getLogger(__name__)
 Ending = tuple[list[Path], list[str]]  # what was made, and commands that may follow
 

@@ -18,7 +18,7 @@ from avatar.simulate.dressing import TravelConfig
 from avatar.simulate.gates import FrameReport, GateConfig
 from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.outfits import DEFAULT_SHAPES, OUTFIT_NAMES, OutfitConfig, outfit
-from avatar.simulate.poses import NamedPose, draw_poses
+from avatar.simulate.poses import KINDS, NamedPose, draw_poses
 from avatar.simulate.production import dress, simulate_motions, simulate_outfit
 from avatar.simulate.sequences import SEQUENCES, authored_motion
 from avatar.values import FileName
@@ -33,14 +33,15 @@ class Preset:
     outfits: tuple[str, ...]
     train: int = 0
     test: int = 0
+    interpolation: int = 0
     train_motions: tuple[str, ...] = ()
     test_motions: tuple[str, ...] = ()
 
 
 PRESETS = {
-    "quick": Preset(("tee",), 32, 12),
-    "sample": Preset(("tee", "dress"), 60, 20),
-    "full": Preset(OUTFIT_NAMES, 300, 100),
+    "quick": Preset(("tee",), 32, 12, 8),
+    "sample": Preset(("tee", "dress"), 60, 20, 10),
+    "full": Preset(OUTFIT_NAMES, 300, 100, 50),
     "motion": Preset(
         ("tee", "dress"), train_motions=("squat", "twist", "bend", "dance"), test_motions=("walk", "reach", "kick")
     ),
@@ -57,8 +58,9 @@ class SimulateConfig:
     )  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>
     outfits: list[str] = field(default_factory=list)  # tee, dress, shirt, skirt, jacket
     shapes: list[FileName] = field(default_factory=list)  # who wears them: female, male, files of tools/make_body.py
-    train: int | None = None  # settled frames of random poses
+    train: int | None = None  # settled frames, half of everyday and half of random poses
     test: int | None = None  # settled frames of authored sequences
+    interpolation: int | None = None  # settled frames of unseen random poses, a test split of its own
     train_motions: list[FileName] = field(default_factory=list)  # names of authored sequences, AMASS npz or BVH files
     test_motions: list[FileName] = field(default_factory=list)  # the same for the test split
     settled: bool = False  # record motion files as settled poses, spread over them, not as continuous sequences
@@ -78,7 +80,7 @@ class SimulateConfig:
         for shape in self.shapes:
             if shape.endswith(".npz") and not Path(shape).is_file():
                 raise AvatarError(f"shapes: {shape}: expected a file of tools/make_body.py, there is none.")
-        for name in ("train", "test", "workers", "history"):
+        for name in (*KINDS, "workers", "history"):
             if (getattr(self, name) or 0) < 0:
                 raise AvatarError(f"{name}: expected a number of at least 0, got {getattr(self, name)}.")
         for name in ("fps", "seconds"):
@@ -123,12 +125,13 @@ def spread_poses(motions: list[Motion], count: int) -> list[NamedPose]:
 
 
 def settled_poses(config: SimulateConfig) -> dict[str, list[NamedPose]]:
-    """The poses of both splits: random draws and authored sequences, or frames of the given motion files."""
+    """The poses of each split: drawn (see `draw_poses`), or frames of the given motion files."""
     preset, poses = PRESETS[config.preset], {}
-    for split in ("train", "test"):
+    for split in KINDS:
         count = getattr(config, split)
         count = getattr(preset, split) if count is None else count
-        motions = [load_motion(source, config.fps, config.seconds) for source in getattr(config, f"{split}_motions")]
+        sources = getattr(config, f"{split}_motions", ())
+        motions = [load_motion(source, config.fps, config.seconds) for source in sources]
         if count:
             poses[split] = spread_poses(motions, count) if motions else draw_poses(count, config.seed, split)
     return poses

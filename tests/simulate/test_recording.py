@@ -16,7 +16,7 @@ from avatar.simulate import gates as gates_module
 from avatar.simulate.dressing import Rest, bind_pose, pose_path
 from avatar.simulate.gates import GateConfig, edge_stretch, frame_names, missed, record_frame
 from avatar.simulate.memory import history_error, pose_sensitivity
-from avatar.simulate.poses import NamedPose
+from avatar.simulate.poses import KINDS, NamedPose
 from avatar.simulate.production import FrameLedger, is_sound, subject
 from avatar.simulate.recording import (
     PRESETS,
@@ -47,8 +47,8 @@ def test_wrong_settings_say_what_is_right(changes, lists):
 
 def test_presets_are_as_promised():
     assert len(PRESETS["quick"].outfits) == 1
-    assert (PRESETS["sample"].train, PRESETS["sample"].test) == (60, 20)
-    assert (PRESETS["full"].train, PRESETS["full"].test, len(PRESETS["full"].outfits)) == (300, 100, 5)
+    assert [getattr(PRESETS["sample"], kind) for kind in KINDS] == [60, 20, 10]
+    assert (PRESETS["full"].train, PRESETS["full"].test) == (300, 100)
     assert not set(PRESETS["motion"].train_motions) & set(PRESETS["motion"].test_motions)
 
 
@@ -74,9 +74,11 @@ def test_bodies_from_files_are_of_the_open_topology(tmp_path):
 
 
 def test_settled_poses_follow_preset_and_overrides():
-    poses = settled_poses(SimulateConfig(preset="quick", train=3, test=0))
+    poses = settled_poses(SimulateConfig(preset="quick", train=3, test=0, interpolation=0))
     assert list(poses) == ["train"] and len(poses["train"]) == 3
-    given = settled_poses(SimulateConfig(train=4, test=2, train_motions=["walk"], test_motions=["kick"], seconds=1.0))
+    given = settled_poses(
+        SimulateConfig(train=4, test=2, interpolation=0, train_motions=["walk"], test_motions=["kick"], seconds=1.0)
+    )
     assert [pose.name.split(".")[0] for pose in given["train"] + given["test"]] == ["walk"] * 4 + ["kick"] * 2
 
 
