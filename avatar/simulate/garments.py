@@ -125,7 +125,7 @@ def garment_field(cutting: Cutting, config: GarmentConfig) -> Grid:
     axes = [np.arange(low[a], high[a], config.edge) for a in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     flat = points.reshape(-1, 3)
-    reach = 0.1 + max(config.ease, config.sleeve_ease, spread)
+    reach = 0.1 + max(config.ease, config.sleeve_ease) + (spread if config.drop is None else 0)
     distance = body_distances(cutting.vertices, cutting.faces, flat, reach)
     _, ids = build_tree(cutting.vertices).query(flat)
     ease = config.ease + (config.sleeve_ease - config.ease) * cutting.arms[ids]
