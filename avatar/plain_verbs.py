@@ -133,13 +133,14 @@ def pack() -> None:
 
     from avatar.checks import AvatarError
     from avatar.data.layouts import open_outfit_folder
+    from avatar.data.outfits import SPLITS
     from avatar.data.packed_layout import write_packed_outfit
 
     try:
         packed = write_packed_outfit(open_outfit_folder(paths.source), paths.target)
     except AvatarError as error:
         sys.exit(refuse("pack", error))
-    count = sum(len(packed.frames(split)) for split in ("train", "test") if packed.has_frames(split))
+    count = sum(len(packed.frames(split)) for split in SPLITS if packed.has_frames(split))
     where = {"dataset": paths.target.parent.name, "outfit": paths.target.name, "data_root": paths.target.parent.parent}
     print(f"{paths.target}: {count} frames")
     print(f"next: {command_line('train', *(option(name, value) for name, value in where.items()))}")

@@ -132,7 +132,7 @@ SHARED = {  # what options mean in several verbs
     "data_root": "folder of data sets",
     "runs_root": "folder that runs are written to",
     "name": "of the run: the last part of its folder",
-    "split": "frames of which split: test, train or validation",
+    "split": "frames of which split: test, interpolation, train or validation",
     "seed": "of all that is drawn at random",
     "device": "auto takes CUDA where there is one",
 }

@@ -188,5 +188,5 @@ def test_what_was_not_made_yet_is_named(job):
         mesh(MeshConfig(run=config.folder, predictions="dance"))
     with pytest.raises(DataError, match=r"no predictions here.*tools/predict\.py"):
         export(ExportConfig(run=config.folder, predictions="dance"))
-    with pytest.raises(AvatarError, match="split: expected train or test"):
+    with pytest.raises(AvatarError, match="split: expected train, test or interpolation"):
         predict(PredictConfig(run=config.folder, split="tests"))

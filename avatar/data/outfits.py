@@ -21,7 +21,7 @@ from avatar.io.documents import read_yaml
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Scan, Template
 
-SPLITS = ("train", "test")
+SPLITS = ("train", "test", "interpolation")  # interpolation: unseen poses of the kind that train has
 VALIDATION = "validation"  # training frames that a run held back: a split of `Outfit.with_validation`
 SAMPLE_FOLDER = Path(__file__).parents[1] / "assets" / "sample"
 OUTFIT_FORMAT = "outfit/1"
@@ -54,15 +54,16 @@ class Outfit(ABC):
     def frames(self, split: str) -> tuple[str, ...]:
         """Names of the frames of a split, sorted.
 
-        Raises `AvatarError` for a split other than train and test, and validation where frames are held back;
-        `DataError` when the split's folder is missing or empty.
+        Raises `AvatarError` for a split that is not in `SPLITS`, nor validation where frames are held back; `DataError`
+        when the split's folder is missing or empty.
         """
         if split == VALIDATION and self.held_back:
             return self.held_back
         if split not in SPLITS:
             held = ", or validation where frames were held back from training" if split == VALIDATION else ""
             near = did_you_mean(split, (*SPLITS, VALIDATION))
-            raise AvatarError(sentences(f"split: expected train or test{held}, got {split!r}.", near))
+            kinds = f"{', '.join(SPLITS[:-1])} or {SPLITS[-1]}"
+            raise AvatarError(sentences(f"split: expected {kinds}{held}, got {split!r}.", near))
         if not self._listed[split]:
             raise DataError(self.path / split, "expected frames (*.npz), found none.", "Make or download the data.")
         return self._listed[split]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar.checks import AvatarError
-from avatar.data.outfits import Outfit
+from avatar.data.outfits import SPLITS, Outfit
 
 SEVERAL_SEQUENCES = 4  # from here on whole sequences are held back, below it frames
 
@@ -39,8 +39,8 @@ class Split:
 def split_outfit(outfit: Outfit, config: SplitConfig | None = None) -> Split:
     """The split of an outfit's training frames, after a check that no test frame is among them."""
     train = outfit.frames("train")
-    test = outfit.frames("test") if outfit.has_frames("test") else ()
-    check_leakage(train, test, outfit.name)
+    for split in SPLITS[1:]:
+        check_leakage(train, outfit.frames(split) if outfit.has_frames(split) else (), f"{outfit.name}, {split}")
     return split_frames(train, config or SplitConfig())
 
 

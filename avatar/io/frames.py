@@ -26,7 +26,8 @@ class OpenFrame:
 
     ``pose (J, 3)`` axis-angle, radians; ``translation (3,)`` metres; ``cloth (Vc, 3)`` metres, posed;
     ``visible_body (Fb,)`` and ``visible_cloth (Fc,)`` bool per face; ``penetration_share`` share of cloth
-    vertices inside the body, ``penetration_depth`` the deepest of them, metres.
+    vertices inside the body, ``penetration_depth`` the deepest of them, metres; ``history`` how many frames were
+    simulated one after another before it: 0 where the cloth settled in this pose alone.
     """
 
     pose: np.ndarray
@@ -36,6 +37,7 @@ class OpenFrame:
     visible_cloth: np.ndarray
     penetration_share: float = 0.0
     penetration_depth: float = 0.0
+    history: int = 0
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def write_open_frame(path: Path, frame: OpenFrame) -> None:
         "visible_cloth": np.packbits(np.asarray(frame.visible_cloth, bool)),
         "penetration": np.array([frame.penetration_share, frame.penetration_depth], np.float32),
     }
-    write_arrays(path, numbers)
+    write_arrays(path, numbers | ({"history": np.array(frame.history, np.int32)} if frame.history else {}))
 
 
 def read_open_frame(path: Path) -> OpenFrame:
@@ -108,6 +110,7 @@ def read_open_frame(path: Path) -> OpenFrame:
             "visible_cloth": "uint8 C",
             "penetration": "float 2",
         },
+        {"history": "int "},
         limit=FRAME_BYTES,
     )
     _check_format(path, stored, FRAME_FORMAT)
@@ -128,6 +131,7 @@ def read_open_frame(path: Path) -> OpenFrame:
         cloth=(quanta * QUANTUM + stored["origin"]).astype(np.float32),
         penetration_share=float(stored["penetration"][0]),
         penetration_depth=float(stored["penetration"][1]),
+        history=int(stored.get("history", 0)),
         **visible,
     )
 

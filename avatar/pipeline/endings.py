@@ -12,7 +12,7 @@ from avatar.progress import WORK, in_words
 from avatar.values import option
 
 RESUMED = ("simulate", "canonicalize", "train", "predict", "evaluate", "mesh", "experiment")  # skip what is finished
-SPLITS = ("train", "test", "validation")
+SPLITS = ("train", "test", "interpolation", "validation")
 report = logging.getLogger(__name__)
 
 

@@ -38,7 +38,7 @@ class PredictConfig:
     """Posed point clouds from a trained run, for the frames of a split or for a motion file."""
 
     run: Path = Path("runs/closet/sample/dress/default")
-    split: str = "test"  # or validation, the training frames that the run held back, or train
+    split: str = "test"  # or interpolation; validation, the frames that the run held back from training; train
     motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
     fps: float = 30.0  # frames a second a motion is resampled to
     up: str | None = None  # y or z, which axis of the motion's file points up; its format's own if null
@@ -54,7 +54,7 @@ class EvaluateConfig:
     """Scores of prediction folders, with the floors in the same table."""
 
     runs: tuple[Path, ...] = (Path("runs/closet/sample/dress/default"),)
-    split: str = "test"  # or validation, the training frames that the runs held back, or train
+    split: str = "test"  # or interpolation; validation, the frames that the runs held back from training; train
     floors: bool = True  # score the sampling floor and the bare body as well
     score: ScoreConfig = field(default_factory=ScoreConfig)
     data_root: Path | None = None  # where the data are now; where they were at training if null

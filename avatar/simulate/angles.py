@@ -10,16 +10,18 @@ from scipy.spatial.transform import Rotation
 from avatar.body.model import SMPL_JOINTS
 from avatar.checks import AvatarError
 
-# The degrees of freedom of a person, in degrees. Arms: 0 abduction hangs, 90 is the T-pose. Only the yaw of the
-# root turns: gravity does not show in the root frame, so a tilted root would change cloth in a way no pose tells.
+# The degrees of freedom of a person, in degrees. Arms: 0 abduction hangs, 90 is the T-pose. The pelvis tilts in
+# everyday poses only: pose encoders see the body in its root frame, where the direction of gravity does not show.
 LIMITS = {
     "yaw": (-25, 25),  # + turns to the left
+    "pelvis_bend": (-15, 40),  # + forward
+    "pelvis_lean": (-15, 15),  # + to the left
     "trunk_bend": (-20, 55),  # + forward
     "trunk_twist": (-40, 40),  # + to the left
-    "trunk_lean": (-25, 25),  # + to the right
+    "trunk_lean": (-25, 25),  # + to the left
     "head_nod": (-30, 35),  # + down
     "head_turn": (-50, 50),  # + to the left
-    "head_tilt": (-20, 20),  # + to the right
+    "head_tilt": (-20, 20),  # + to the left
     "hip_flexion": (-25, 85),  # + knee forward and up
     "hip_abduction": (-4, 40),  # + outward
     "hip_turn": (-20, 30),  # + toes outward
@@ -32,7 +34,7 @@ LIMITS = {
     "forearm_turn": (-40, 40),
     "wrist_bend": (-25, 25),
 }
-CENTRAL = {name for name in LIMITS if name.split("_")[0] in ("yaw", "trunk", "head")}
+CENTRAL = {name for name in LIMITS if name.split("_")[0] in ("yaw", "pelvis", "trunk", "head")}
 STANCE = {
     "arm_abduction": 27,
     "arm_flexion": 4,
@@ -66,7 +68,8 @@ def pose_from_angles(angles: Angles, frames: int) -> np.ndarray:
         value = np.broadcast_to(np.asarray(angles.get(name, STANCE.get(base, 0)), np.float64), (frames,))
         return np.clip(value, *LIMITS[base])
 
-    turns: dict[str, Rotation] = {"pelvis": _turn(y=angle("yaw"))}
+    tilt = _turn(x=angle("pelvis_bend"), z=-angle("pelvis_lean"))
+    turns: dict[str, Rotation] = {"pelvis": _turn(y=angle("yaw")) * tilt}
     bend, twist, lean = (angle(f"trunk_{kind}") for kind in ("bend", "twist", "lean"))
     for joint, share in (("spine1", 0.3), ("spine2", 0.35), ("spine3", 0.35)):
         turns[joint] = _turn(x=bend * share, y=twist * share, z=-lean * share)

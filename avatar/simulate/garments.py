@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,18 +33,23 @@ BLUR = 0.012  # metres by which the field is smoothed
 CROTCH = 0.06  # metres of gap between the thighs that is bridged softly
 NECK_FOOT = 0.04  # metres above the neck joint where garments end at the latest
 BLEND = 0.03  # metres over which a hanging tube melts into the close-fitting part
+HOOD_EASE, HOOD_NECK = 0.006, 0.1  # metres: more ease around the head, radius around the neck
+FACE_HALF_WIDTH = 0.092  # metres
 LEVELS = ("left_ankle", "left_knee", "left_hip", "spine1", "spine3", "neck")
 ARM_JOINTS = ("shoulder", "elbow", "wrist")
 
 
 @dataclass(frozen=True)
 class Cutting:
-    """The body a garment is cut on: bind-pose ``vertices``, ``faces``, ``joints`` by name, ``arms (V,)`` weight."""
+    """The body a garment is cut on: bind-pose ``vertices``, ``faces``, ``joints`` by name, weights ``(V,)`` of the
+    ``arms`` and of the ``head``.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
     joints: dict[str, np.ndarray]
     arms: np.ndarray
+    head: np.ndarray
 
     @classmethod
     def of(cls, body: BodyModel) -> Cutting:
@@ -55,6 +61,7 @@ class Cutting:
             body.faces.numpy(),
             dict(zip(body.joint_names, joints)),
             body.weights[:, arm_ids].sum(dim=1).double().numpy(),
+            body.weights[:, body.joint_names.index("head")].double().numpy(),
         )
 
     def height(self, level: float) -> float:
@@ -111,17 +118,27 @@ def cut_garment(body: BodyModel, config: GarmentConfig) -> Garment:
 def garment_field(cutting: Cutting, config: GarmentConfig) -> Grid:
     """The signed field whose zero level is the uncut garment: the body with ease, melted into a hanging tube."""
     bottom = cutting.height(config.bottom)
-    spread = 0.0 if config.drop is None else config.flare * (cutting.height(config.drop) - bottom)
+    hip = cutting.height(2 if config.drop is None else config.drop)
+    spread = config.flare * (hip - bottom)
     low, high = cutting.vertices.min(0) - PAD - spread, cutting.vertices.max(0) + PAD + spread
     low[1] = bottom - PAD / 2
     axes = [np.arange(low[a], high[a], config.edge) for a in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     flat = points.reshape(-1, 3)
-    reach = 0.1 + max(config.ease, config.sleeve_ease)
+    reach = 0.1 + max(config.ease, config.sleeve_ease) + (spread if config.drop is None else 0)
     distance = body_distances(cutting.vertices, cutting.faces, flat, reach)
     _, ids = build_tree(cutting.vertices).query(flat)
     ease = config.ease + (config.sleeve_ease - config.ease) * cutting.arms[ids]
+    if config.hood:
+        ease += HOOD_EASE * cutting.head[ids]
+    elif config.drop is None:
+        ease += config.flare * np.maximum(hip - flat[:, 1], 0)
     field = distance - ease - crotch_fill(cutting, flat)
+    if config.flare and config.drop is None:  # legs stay apart
+        apart = np.clip((hip - CROTCH - flat[:, 1]) / CROTCH, 0, 1)
+        field = -smooth_minimum(-field, np.abs(flat[:, 0]) + 0.05 - 0.06 * apart, 0.01)
+    if config.hood:
+        field = smooth_minimum(field, neck_tube(cutting, flat), BLEND)
     if config.drop is not None:
         field = smooth_minimum(field, hanging_tube(cutting, config, flat), BLEND)
     return Grid(gaussian_filter(field.reshape(points.shape[:3]), BLUR / config.edge), low, config.edge)
@@ -154,6 +171,13 @@ def hanging_tube(cutting: Cutting, config: GarmentConfig, points: np.ndarray) ->
     return np.maximum((radius - 1) * np.minimum(half_width, half_depth), points[:, 1] - start)
 
 
+def neck_tube(cutting: Cutting, points: np.ndarray) -> np.ndarray:
+    """Approximate signed distance of ``(N, 3)`` points to a hood's upright tube, from the shoulders to the jaw."""
+    neck, head = cutting.joints["neck"], cutting.joints["head"]
+    radius = np.hypot(points[:, 0], points[:, 2] - (neck[2] + head[2]) / 2) - HOOD_NECK
+    return np.maximum(radius, np.maximum(neck[1] - 0.03 - points[:, 1], points[:, 1] - head[1] - 0.04))
+
+
 def smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
     """Minimum of two fields, rounded where they meet (polynomial, Quilez)."""
     mix = np.clip(0.5 + 0.5 * (b - a) / width, 0, 1)
@@ -167,7 +191,7 @@ def cuts(cutting: Cutting, config: GarmentConfig) -> list:
     if config.top is not None:
         top = cutting.height(config.top)
         return [*made, lambda v, arm: v[:, 1] - top]
-    made += neckline(cutting, config)
+    made += [face_opening(cutting)] if config.hood else neckline(cutting, config)
     for side in ("left", "right"):
         chain = np.stack([cutting.joints[f"{side}_{joint}"] for joint in ARM_JOINTS])
         start = min(int(config.sleeve), 1)
@@ -183,6 +207,18 @@ def cuts(cutting: Cutting, config: GarmentConfig) -> list:
         depth = cutting.joints["neck"][2]
         made.append(lambda v, arm: np.where((arm < 0.5) & (v[:, 2] > depth), half - np.abs(v[:, 0]), -1.0))
     return made
+
+
+def face_opening(cutting: Cutting) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """The cut of a hood's front: an ellipse from under the chin to the forehead."""
+    head, top = cutting.joints["head"], cutting.vertices[:, 1].max()
+    middle, half = head[1] + 0.42 * (top - head[1]), 0.52 * (top - head[1])
+
+    def opening(v, arm):
+        radius = np.hypot(v[:, 0] / FACE_HALF_WIDTH, (v[:, 1] - middle) / half)
+        return np.minimum((1 - radius) * FACE_HALF_WIDTH, v[:, 2] - head[2] - 0.02)
+
+    return opening
 
 
 def neckline(cutting: Cutting, config: GarmentConfig) -> list:

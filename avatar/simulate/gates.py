@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -108,18 +108,18 @@ def record_frame(dressed: DressedBody, pose: NamedPose, path: Path, gates: GateC
     return report
 
 
-def frame_names(motion: Motion) -> list[str]:
-    """Names ``<sequence>.<frame>`` of a motion's frames."""
-    return [f"{motion.name}.{frame:05d}" for frame in range(len(motion.poses))]
+def frames_of(motion: Motion) -> list[NamedPose]:
+    """Poses of a motion's frames, named ``<sequence>.<frame>``."""
+    return [NamedPose(f"{motion.name}.{frame:05d}", pose) for frame, pose in enumerate(motion.poses)]
 
 
 def record_motion(dressed: DressedBody, motion: Motion, folder: Path, gates: GateConfig) -> list[FrameReport]:
-    """Plays a sequence and writes all its frames, with the gates each of them missed (rest is not asked for)."""
+    """Plays a sequence and writes all its frames; reports which gates each of them missed (rest is not asked for)."""
     folder.mkdir(parents=True, exist_ok=True)
     reports = []
-    for name, pose, cloth in zip(frame_names(motion), motion.poses, dressed.play(motion.poses)):
-        frame = examine(dressed, pose, cloth)
+    for history, (named, cloth) in enumerate(zip(frames_of(motion), dressed.play(motion.poses))):
+        frame = replace(examine(dressed, named.pose, cloth), history=history)
         measured = measure(dressed, frame, 0.0)
-        write_open_frame(folder / f"{name}.npz", frame)
-        reports.append(FrameReport(name, missed(measured, gates), **measured, attempts=1))
+        write_open_frame(folder / f"{named.name}.npz", frame)
+        reports.append(FrameReport(named.name, missed(measured, gates), **measured, attempts=1))
     return reports

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from avatar.checks import AvatarError, unknown_name
 
@@ -39,7 +39,8 @@ class GarmentConfig:
     ease: float = 0.012  # m between body and cloth at rest
     sleeve_ease: float = 0.012  # m, the same along the arms
     drop: float | None = None  # level from which the cloth hangs as one tube; None follows the body
-    flare: float = 0.0  # m of half width gained per metre below the drop
+    flare: float = 0.0  # m of half width gained per metre below the drop; without a drop, by each leg below the hip
+    hood: bool = False  # covers the head but for the face; without a top
     opening: float = 0.0  # m, width of the open front; 0 is closed
     neck: float = 0.0  # m by which the neckline is lowered
     edge: float = 0.018  # m, target edge length
@@ -70,7 +71,7 @@ def trousers(**changes) -> GarmentConfig:
     """Tight ankle-length trousers held by an elastic waistband."""
     denim = FabricConfig(density=0.25, stretch=100.0, shear=40.0, bend=5e-5, thickness=0.006)
     settings = {"bottom": 0.1, "top": 2.75, "ease": 0.011, "edge": 0.0225, "waistband": 0.03, "cling": 0.02}
-    return GarmentConfig("trousers", fabric=denim, **settings | changes)
+    return GarmentConfig(**{"name": "trousers", "fabric": denim} | settings | changes)
 
 
 def tee(**changes) -> GarmentConfig:
@@ -116,17 +117,56 @@ GARMENTS = {
             fabric=FabricConfig(density=0.3, bend=4e-5),
         ),
     ],
+    "coat": lambda: [
+        trousers(edge=0.024),
+        tee(bottom=2.4, sleeve=0.4, room=0.022, ease=0.01, sleeve_ease=0.01, edge=0.024),
+        GarmentConfig(
+            "coat",
+            bottom=0.75,
+            sleeve=1.9,
+            ease=0.025,
+            sleeve_ease=0.024,
+            drop=3.6,
+            flare=0.09,
+            opening=0.05,
+            edge=0.023,
+            cling=0.04,
+            fabric=FabricConfig(density=0.3, bend=6e-5, friction=0.3),
+        ),
+    ],
+    "slacks": lambda: [
+        trousers(name="slacks", flare=0.1, fabric=FabricConfig(density=0.2, bend=2e-5), edge=0.02),
+        tee(bottom=2.4, edge=0.018),
+    ],
+    "hoodie": lambda: [
+        trousers(edge=0.024),
+        GarmentConfig(
+            "hoodie",
+            bottom=1.95,
+            sleeve=1.9,
+            ease=0.026,
+            sleeve_ease=0.026,
+            hood=True,
+            edge=0.02,
+            fabric=FabricConfig(density=0.3, bend=4e-5),
+        ),
+    ],
 }
 OUTFIT_NAMES = tuple(GARMENTS)
-DEFAULT_SHAPES = {"tee": "male", "shirt": "male", "skirt": "female", "dress": "female", "jacket": "female"}
+DEFAULT_SHAPES = {name: "male" if name in ("tee", "shirt", "coat") else "female" for name in GARMENTS}
 
 
-def outfit(name: str, shape: str | None = None) -> OutfitConfig:
-    """A named outfit on a body shape, its usual one if None.
+def outfit(name: str, shape: str | None = None, edge: float | None = None) -> OutfitConfig:
+    """A named outfit on a body shape, its usual one if None; ``edge`` the target edge length of all garments, metres.
+
+    Cling is a force a vertex: with more vertices to an area each of them is pulled less.
 
     Raises:
         AvatarError: for an unknown name, listing those there are.
     """
     if name not in GARMENTS:
         raise unknown_name("outfit", name, GARMENTS)
-    return OutfitConfig(name, shape or DEFAULT_SHAPES[name], GARMENTS[name]())
+    garments = GARMENTS[name]()
+    if edge is not None:
+        garments = [replace(g, edge=edge, cling=g.cling * min(1, edge / g.edge) ** 2) for g in garments]
+    return OutfitConfig(name, shape or DEFAULT_SHAPES[name], garments)

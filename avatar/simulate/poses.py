@@ -1,11 +1,13 @@
-"""Poses for the open dataset: random draws to train on, authored sequences (another kind) to test on."""
+"""Poses for the open dataset: everyday and random ones to train on, random and authored ones to test on."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 
 from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.body.open import open_body, open_body_shapes
@@ -13,9 +15,12 @@ from avatar.checks import AvatarError
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.trees import build_tree
 from avatar.simulate.angles import LIMITS, Angles, pose_from_angles
+from avatar.simulate.everyday import EVERYDAY, everyday_angles
 from avatar.simulate.sequences import SEQUENCES, authored_motion
 
 CLEARANCE = 0.03  # metres kept between forearms, hands, legs and the rest, so that cloth finds room
+APART = 0.5  # radians, norm over all joints' axis-angles: no training pose is nearer to a frame of a test motion
+KINDS = ("train", "test", "interpolation")
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,7 @@ class NamedPose:
     pose: np.ndarray
 
 
-def random_angles(count: int, seed: int) -> Angles:
+def random_angles(count: int, seed: int | list[int]) -> Angles:
     """Degrees of freedom of random poses, ``(count,)`` each: broad, correlated as people are, and spread evenly.
 
     A scrambled Sobol sequence over 27 factors, so that any number of first draws covers the space well. Hips and
@@ -71,33 +76,55 @@ def random_angles(count: int, seed: int) -> Angles:
 def draw_poses(count: int, seed: int, kind: str) -> list[NamedPose]:
     """Poses of one kind, none of which makes an open body touch itself.
 
-    ``train``: random draws (``random.<number>``). ``test``: frames of the authored sequences, spread over each of
-    them (``walk.<frame>``); these are motions people make, which no random draw repeats.
+    ``train``: even numbers everyday poses, in turn from each family of `EVERYDAY`, odd numbers random draws
+    (``pose.<number>``); none is within `APART` of a frame of a test motion. ``interpolation``: random draws of
+    another sequence (``random.<number>``). ``test``: frames of the authored sequences, spread over each of them
+    (``walk.<frame>``).
 
     Args:
         count: how many, at least 1; seed: the same seed gives the same poses, whatever was drawn before.
-        kind: train or test.
+        kind: train, test or interpolation.
 
     Raises:
         AvatarError: for an unknown kind or a count that cannot be met.
     """
-    if kind not in ("train", "test"):
-        raise AvatarError(f"kind: expected train or test, got {kind!r}.")
+    if kind not in KINDS:
+        raise AvatarError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}.")
     if count < 1:
         raise AvatarError(f"count: expected at least 1 pose, got {count}.")
-    return _random_poses(count, seed) if kind == "train" else _authored_poses(count, seed)
+    if kind == "test":
+        return _authored_poses(count, seed)
+    if kind == "interpolation":
+        drawn = accepted_poses(lambda n: random_angles(n, [seed, 1000]), count)
+        return [NamedPose(f"random.{i:05d}", pose) for i, pose in enumerate(drawn)]
+    everyday = [
+        everyday_poses(name, len(range(2 * place, count, 2 * len(EVERYDAY))), seed)
+        for place, name in enumerate(EVERYDAY)
+    ]
+    drawn = accepted_poses(lambda n: random_angles(n, seed), count // 2)
+    even = (everyday[i % len(EVERYDAY)][i // len(EVERYDAY)] for i in range((count + 1) // 2))
+    odd = iter(drawn)
+    return [NamedPose(f"pose.{i:05d}", next(odd if i % 2 else even)) for i in range(count)]
 
 
-def _random_poses(count: int, seed: int) -> list[NamedPose]:
-    """The first ``count`` random draws that are clear of themselves."""
+def everyday_poses(name: str, count: int, seed: int) -> list[np.ndarray]:
+    """The first ``count`` acceptable poses ``(22, 3)`` of a family of `EVERYDAY`."""
+    return accepted_poses(lambda n: everyday_angles(name, n, seed), count)
+
+
+def accepted_poses(angles: Callable[[int], Angles], count: int) -> list[np.ndarray]:
+    """The first ``count`` draws that are clear of themselves and apart from the frames of all test motions."""
+    tested = np.concatenate([authored_motion(name, seconds=period).poses for name, (period, _) in SEQUENCES.items()])
     drawn = 1 << int(np.ceil(np.log2(count * 1.5 + 8)))  # Sobol sequences are balanced at powers of two
     while drawn <= 64 * (count + 8):
-        poses = pose_from_angles(random_angles(drawn, seed), drawn)
+        poses = pose_from_angles(angles(drawn), drawn)
+        apart = cdist(poses.reshape(drawn, -1), tested.reshape(len(tested), -1)).min(axis=1) > APART
         kept: list[np.ndarray] = []
-        for part in np.split(poses, range(32, drawn, 32)):
-            kept.extend(part[clear_of_itself(part)])
-            if len(kept) >= count:
-                return [NamedPose(f"random.{i:05d}", pose) for i, pose in enumerate(kept[:count])]
+        for part in np.split(poses[apart], range(32, int(apart.sum()), 32)):
+            if len(kept) < count:
+                kept.extend(part[clear_of_itself(part)])
+        if len(kept) >= count:
+            return kept[:count]
         drawn *= 2
     raise AvatarError(f"count: expected poses that do not touch themselves, found too few for {count}.")
 

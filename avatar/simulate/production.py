@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
@@ -23,52 +23,51 @@ from avatar.processes import in_workers
 from avatar.progress import tracked
 from avatar.records import Motion
 from avatar.simulate.dressing import DressedBody, TravelConfig
-from avatar.simulate.gates import FrameReport, GateConfig, frame_names, record_frame, record_motion
+from avatar.simulate.gates import FrameReport, GateConfig, frames_of, record_frame, record_motion
 from avatar.simulate.outfits import OutfitConfig
 from avatar.simulate.poses import NamedPose
 
+Job = NamedPose | Motion  # a pose to settle in, or a sequence to play
+
 
 class FrameLedger:
-    """Which frames of an outfit's folder are finished: by hash, and by pose and garment, which they are made from.
+    """Finished frames of an outfit's folder: by hash, and by the pose, garment and history they are made from.
 
-    A sound frame that no ledger knows of, as a killed run and older versions leave them, is taken over.
+    A valid frame that no ledger lists, as an interrupted run leaves it, is taken over.
     """
 
     def __init__(self, folder: Path, vertices: int):
         self.folder, self.vertices = folder, vertices
         self.ledger, self.garment = Ledger(folder), file_digest(folder / "garment.npz")
 
-    def has(self, path: Path, pose: np.ndarray) -> bool:
+    def has(self, path: Path, pose: np.ndarray, history: int = 0) -> bool:
         """Whether a frame is there as it was written."""
-        name, key = self._identify(path, pose)
-        if name in self.ledger.entries or not is_sound(path, pose, self.vertices):
+        name, key = self._identify(path, pose, history)
+        if name in self.ledger.entries or not is_sound(path, pose, self.vertices, history):
             return self.ledger.find(name, key) is not None
         self.ledger.record(name, key, [path])
         return True
 
-    def note(self, path: Path, pose: np.ndarray) -> None:
-        """Takes down a frame that was made, if it passed its gates and was written."""
+    def note(self, path: Path, pose: np.ndarray, history: int = 0) -> None:
+        """Records a frame that was made, if it passed its gates and was written."""
         if path.is_file():
-            self.ledger.record(*self._identify(path, pose), [path])
+            self.ledger.record(*self._identify(path, pose, history), [path])
 
-    def note_all(self, frames: Iterable[tuple[Path, np.ndarray]]) -> None:
-        """Takes down all frames of a sequence."""
-        for path, pose in frames:
-            self.note(path, pose)
-
-    def _identify(self, path: Path, pose: np.ndarray) -> tuple[str, str]:
+    def _identify(self, path: Path, pose: np.ndarray, history: int) -> tuple[str, str]:
         """A frame's name and key."""
-        numbers = np.asarray(pose, np.float32).tolist()
-        return path.relative_to(self.folder).as_posix(), digest_of({"pose": numbers, "garment": self.garment})
+        made_of = {"pose": np.asarray(pose, np.float32).tolist(), "garment": self.garment}
+        made_of |= {"history": history} if history else {}
+        return path.relative_to(self.folder).as_posix(), digest_of(made_of)
 
 
-def is_sound(path: Path, pose: np.ndarray, vertex_count: int) -> bool:
-    """Whether a frame is there, readable, of this pose and this outfit."""
+def is_sound(path: Path, pose: np.ndarray, vertex_count: int, history: int = 0) -> bool:
+    """Whether a frame is there, readable, of this pose, this outfit and this history."""
     try:
         frame = read_open_frame(path)
     except DataError:
         return False
-    return len(frame.cloth) == vertex_count and np.array_equal(frame.pose, np.asarray(pose, np.float32))
+    same = np.array_equal(frame.pose, np.asarray(pose, np.float32)) and frame.history == history
+    return same and len(frame.cloth) == vertex_count
 
 
 @contextmanager
@@ -146,96 +145,65 @@ def _start_worker(outfit: OutfitConfig, travel: TravelConfig, gates: GateConfig)
     _worker["dressed"], _worker["gates"] = dress(outfit, travel), gates
 
 
-def _play_in_worker(motion: Motion, folder: Path) -> list[FrameReport]:
-    """One sequence in a worker process."""
-    return record_motion(_worker["dressed"], motion, folder, _worker["gates"])
+def _record_in_worker(job: Job, folder: Path) -> list[FrameReport]:
+    """One frame or sequence in a worker process."""
+    return record(_worker["dressed"], job, folder, _worker["gates"])
 
 
-def _record_in_worker(pose: NamedPose, path: Path) -> FrameReport:
-    """One frame in a worker process."""
-    return record_frame(_worker["dressed"], pose, path, _worker["gates"])
+def record(dressed: DressedBody, job: Job, folder: Path, gates: GateConfig) -> list[FrameReport]:
+    """Writes a settled frame, or all frames of a sequence, into a split's folder."""
+    if isinstance(job, Motion):
+        return record_motion(dressed, job, folder, gates)
+    return [record_frame(dressed, job, folder / f"{job.name}.npz", gates)]
 
 
 def simulate_outfit(
     outfit: OutfitConfig,
     folder: Path,
-    poses: dict[str, Sequence[NamedPose]],
+    work: dict[str, Sequence[Job]],
     workers: int = 1,
     travel: TravelConfig | None = None,
     gates: GateConfig | None = None,
     progress: bool = True,
 ) -> list[FrameReport]:
-    """Simulates and writes an outfit's settled frames; those there and sound are kept, so that a run resumes.
+    """Simulates and writes an outfit's frames; those finished are kept, so that a run resumes.
+
+    Every pose is settled by itself; every frame of a motion follows from the one before. Sequences resume as a whole,
+    and their frames are written where they miss a gate too, since a gap would break the sequence.
 
     Args:
         outfit: what is worn, by which body.
         folder: the outfit's folder; frames go to ``<folder>/<split>/<sequence>.<frame>.npz``.
-        poses: poses of each split.
+        work: poses or motions of each split.
         workers: processes; 1 works in this one.
         travel, gates: settings; defaults if None.
         progress: whether to show a progress bar.
 
     Returns:
-        A report of every frame made in this run; those with ``failed`` were not written.
+        A report of every frame made in this run, with the gates that it ``failed``.
     """
     travel, gates = travel or TravelConfig(), gates or GateConfig()
     with one_thread():
         dressed = dress(outfit, travel)
         write_outfit(dressed, folder, gates)
-        jobs = [(pose, folder / split / f"{pose.name}.npz") for split, named in poses.items() for pose in named]
         done = FrameLedger(folder, len(dressed.labels))
-        jobs = [(pose, path) for pose, path in jobs if not done.has(path, pose.pose)]
+
+        def frames(job: Job, place: Path) -> list[tuple[Path, np.ndarray, int]]:
+            named = frames_of(job) if isinstance(job, Motion) else [job]
+            return [(place / f"{frame.name}.npz", frame.pose, history) for history, frame in enumerate(named)]
+
+        jobs = [(job, folder / split) for split, jobs in work.items() for job in jobs]
+        jobs = [job for job in jobs if not all(done.has(*frame) for frame in frames(*job))]
         bar = {"total": len(jobs), "what": f"simulate {outfit.name} on {outfit.shape}", "silent": not progress}
         if workers == 1 or len(jobs) < 2:
-            made = ((job, record_frame(dressed, *job, gates)) for job in jobs)
+            made = ((job, record(dressed, *job, gates)) for job in jobs)
         else:
             made = in_workers(_record_in_worker, jobs, workers, _start_worker, (outfit, travel, gates))
         reports = []
         with closing(made):
-            for (pose, path), report in tracked(made, **bar):
-                reports.append(report)
-                done.note(path, pose.pose)
+            for job, found in tracked(made, **bar):
+                reports += found
+                for frame in frames(*job):
+                    done.note(*frame)
     write_manifest(folder)
     return reports
-
-
-def simulate_motions(
-    outfit: OutfitConfig,
-    folder: Path,
-    motions: dict[str, Sequence[Motion]],
-    workers: int = 1,
-    travel: TravelConfig | None = None,
-    gates: GateConfig | None = None,
-) -> list[FrameReport]:
-    """Simulates continuous sequences: every frame follows from the one before; whole sequences resume.
-
-    Frames that miss a gate are written too, since a gap would break the sequence, and reported.
-
-    Args:
-        outfit, folder, workers, travel, gates: as `simulate_outfit`.
-        motions: sequences of each split.
-    """
-    travel, gates = travel or TravelConfig(), gates or GateConfig()
-    with one_thread():
-        dressed = dress(outfit, travel)
-        write_outfit(dressed, folder, gates)
-        jobs = [(motion, folder / split) for split, named in motions.items() for motion in named]
-        done = FrameLedger(folder, len(dressed.labels))
-        jobs = [job for job in jobs if not all(done.has(*frame) for frame in frames_of(*job))]
-        bar = {"total": len(jobs), "what": f"simulate {outfit.name} on {outfit.shape}", "unit": "sequence"}
-        if workers == 1 or len(jobs) < 2:
-            made = ((job, record_motion(dressed, *job, gates)) for job in jobs)
-        else:
-            made = in_workers(_play_in_worker, jobs, workers, _start_worker, (outfit, travel, gates))
-        reports = []
-        with closing(made):
-            for job, report in tracked(made, **bar):
-                reports.append(report)
-                done.note_all(frames_of(*job))
-    write_manifest(folder)
-    return [report for part in reports for report in part]
-
-
-def frames_of(motion: Motion, folder: Path) -> list[tuple[Path, np.ndarray]]:
-    """Files and poses of a sequence's frames."""
-    return [(folder / f"{name}.npz", pose) for name, pose in zip(frame_names(motion), motion.poses)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 from dataclasses import dataclass, field
@@ -14,12 +15,13 @@ from avatar.checks import AvatarError, unknown_name
 from avatar.environment import prepared_process
 from avatar.io.motions import read_motion, resample_motion
 from avatar.records import Motion
-from avatar.simulate.dressing import TravelConfig
+from avatar.simulate.dressing import TravelConfig, pose_path
+from avatar.simulate.everyday import EVERYDAY
 from avatar.simulate.gates import FrameReport, GateConfig
 from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.outfits import DEFAULT_SHAPES, OUTFIT_NAMES, OutfitConfig, outfit
-from avatar.simulate.poses import NamedPose, draw_poses
-from avatar.simulate.production import dress, simulate_motions, simulate_outfit
+from avatar.simulate.poses import KINDS, NamedPose, draw_poses, everyday_poses
+from avatar.simulate.production import dress, simulate_outfit
 from avatar.simulate.sequences import SEQUENCES, authored_motion
 from avatar.values import FileName
 
@@ -33,17 +35,16 @@ class Preset:
     outfits: tuple[str, ...]
     train: int = 0
     test: int = 0
+    interpolation: int = 0
     train_motions: tuple[str, ...] = ()
     test_motions: tuple[str, ...] = ()
 
 
 PRESETS = {
-    "quick": Preset(("tee",), 32, 12),
-    "sample": Preset(("tee", "dress"), 60, 20),
-    "full": Preset(OUTFIT_NAMES, 300, 100),
-    "motion": Preset(
-        ("tee", "dress"), train_motions=("squat", "twist", "bend", "dance"), test_motions=("walk", "reach", "kick")
-    ),
+    "quick": Preset(("tee",), 32, 12, 8),
+    "sample": Preset(("tee", "dress"), 60, 20, 10),
+    "full": Preset(OUTFIT_NAMES, 300, 100, 50),
+    "motion": Preset(("tee", "dress"), train_motions=tuple(EVERYDAY), test_motions=tuple(SEQUENCES)),
 }
 
 
@@ -54,16 +55,19 @@ class SimulateConfig:
     preset: str = "quick"  # quick, sample, full, motion
     root: Path = Path(
         "data/open"
-    )  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>
-    outfits: list[str] = field(default_factory=list)  # tee, dress, shirt, skirt, jacket
+    )  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>; sequences to *_motion
+    outfits: list[str] = field(default_factory=list)  # tee, dress, shirt, skirt, jacket, coat, slacks, hoodie
     shapes: list[FileName] = field(default_factory=list)  # who wears them: female, male, files of tools/make_body.py
-    train: int | None = None  # settled frames of random poses
+    edge: float | None = None  # m, target edge length of all garments; each garment's own if null
+    train: int | None = None  # settled frames, half of everyday and half of random poses
     test: int | None = None  # settled frames of authored sequences
-    train_motions: list[FileName] = field(default_factory=list)  # names of authored sequences, AMASS npz or BVH files
+    interpolation: int | None = None  # settled frames of unseen random poses, a test split of its own
+    # names of everyday families (stand, stride, ...) or of authored sequences (walk, ...), AMASS npz or BVH files
+    train_motions: list[FileName] = field(default_factory=list)
     test_motions: list[FileName] = field(default_factory=list)  # the same for the test split
     settled: bool = False  # record motion files as settled poses, spread over them, not as continuous sequences
     fps: float = 30.0  # frames per second of continuous sequences
-    seconds: float = 6.0  # longest part taken of a sequence
+    seconds: float = 3.0  # longest part taken of a sequence
     seed: int = 0
     workers: int = 0  # processes; 0 is one a core
     history: int = 0  # poses on which history error and pose sensitivity are measured instead of recording
@@ -78,7 +82,7 @@ class SimulateConfig:
         for shape in self.shapes:
             if shape.endswith(".npz") and not Path(shape).is_file():
                 raise AvatarError(f"shapes: {shape}: expected a file of tools/make_body.py, there is none.")
-        for name in ("train", "test", "workers", "history"):
+        for name in (*KINDS, "workers", "history"):
             if (getattr(self, name) or 0) < 0:
                 raise AvatarError(f"{name}: expected a number of at least 0, got {getattr(self, name)}.")
         for name in ("fps", "seconds"):
@@ -99,16 +103,25 @@ def dressed_outfits(config: SimulateConfig) -> list[tuple[str, OutfitConfig]]:
     for name in config.outfits or PRESETS[config.preset].outfits:
         usual = DEFAULT_SHAPES[name]
         for shape in config.shapes or [usual]:
-            asked.append((name if shape == usual else f"{name}_{Path(shape).stem}", outfit(name, shape)))
+            asked.append((name if shape == usual else f"{name}_{Path(shape).stem}", outfit(name, shape, config.edge)))
     return asked
 
 
-def load_motion(source: str, fps: float, seconds: float) -> Motion:
-    """An authored sequence by name, or a motion file, with its translation dropped (the pelvis stays in place)."""
+def load_motion(source: str, fps: float, seconds: float, seed: int = 0) -> Motion:
+    """An authored or everyday sequence by name, or a motion file without its translation (the pelvis stays in place).
+
+    An everyday sequence passes one drawn pose of its family a second.
+    """
     if source in SEQUENCES:
         return authored_motion(source, fps, seconds)
+    if source in EVERYDAY:
+        stops = everyday_poses(source, int(np.ceil(seconds)) + 1, seed)
+        legs = [pose_path(a, b, round(fps)) for a, b in itertools.pairwise(stops)]
+        poses = np.concatenate([stops[0][None], *legs])[: round(fps * seconds)]
+        return Motion(poses, np.zeros((len(poses), 3), np.float32), fps, source)
     if Path(source).suffix not in (".npz", ".bvh"):
-        raise AvatarError(f"motion: expected {', '.join(SEQUENCES)} or a .npz or .bvh file, got {source!r}.")
+        known = ", ".join((*SEQUENCES, *EVERYDAY))
+        raise AvatarError(f"motion: expected {known} or a .npz or .bvh file, got {source!r}.")
     motion = resample_motion(read_motion(Path(source)), fps)
     count = round(fps * seconds)
     return Motion(motion.poses[:count], np.zeros_like(motion.translations[:count]), fps, motion.name)
@@ -123,12 +136,13 @@ def spread_poses(motions: list[Motion], count: int) -> list[NamedPose]:
 
 
 def settled_poses(config: SimulateConfig) -> dict[str, list[NamedPose]]:
-    """The poses of both splits: random draws and authored sequences, or frames of the given motion files."""
+    """The poses of each split: drawn (see `draw_poses`), or frames of the given motion files."""
     preset, poses = PRESETS[config.preset], {}
-    for split in ("train", "test"):
+    for split in KINDS:
         count = getattr(config, split)
         count = getattr(preset, split) if count is None else count
-        motions = [load_motion(source, config.fps, config.seconds) for source in getattr(config, f"{split}_motions")]
+        sources = getattr(config, f"{split}_motions", ())
+        motions = [load_motion(source, config.fps, config.seconds, config.seed) for source in sources]
         if count:
             poses[split] = spread_poses(motions, count) if motions else draw_poses(count, config.seed, split)
     return poses
@@ -142,16 +156,16 @@ def simulate(config: SimulateConfig) -> list[FrameReport]:
         Reports of the frames made in this run; those refused by the gates say why and are logged as warnings.
     """
     workers = config.workers or len(os.sched_getaffinity(0))
-    preset, root = PRESETS[config.preset], config.root
+    preset = PRESETS[config.preset]
     sources = {
         split: getattr(config, f"{split}_motions") or list(getattr(preset, f"{split}_motions"))
         for split in ("train", "test")
     }
     continuous = any(sources.values()) and not config.settled
     if continuous:
-        motions = {k: [load_motion(s, config.fps, config.seconds) for s in v] for k, v in sources.items()}
-    else:
-        poses = settled_poses(config)
+        work = {k: [load_motion(s, config.fps, config.seconds, config.seed) for s in v] for k, v in sources.items()}
+    elif not config.history:
+        work = settled_poses(config)
     reports: list[FrameReport] = []
     for folder, clothes in dressed_outfits(config):
         if config.history:
@@ -159,13 +173,12 @@ def simulate(config: SimulateConfig) -> list[FrameReport]:
             measured = draw_poses(config.history + 1, config.seed, "test")
             log.info("%s: %s", folder, history_error(dressed, measured))
             log.info("%s: %s", folder, pose_sensitivity(dressed, measured[:-1], seed=config.seed))
-        elif continuous:
-            reports += simulate_motions(clothes, root / folder, motions, workers, config.travel, config.gates)
         else:
-            reports += simulate_outfit(
-                clothes, root / folder, poses, workers, config.travel, config.gates, config.progress
-            )
+            place = config.root / f"{folder}{'_motion' if continuous else ''}"
+            reports += simulate_outfit(clothes, place, work, workers, config.travel, config.gates, config.progress)
     for report in reports:
         if report.failed:
-            log.warning("%s: refused after %d attempts: %s", report.name, report.attempts, "; ".join(report.failed))
+            log.warning(
+                "%s: gates missed after %d attempts: %s", report.name, report.attempts, "; ".join(report.failed)
+            )
     return reports

@@ -344,7 +344,7 @@ def test_outfits_are_found_by_name(tiny_folder):
         find_outfit(root, "open", "tinny")
     with pytest.raises(DataError, match="expected the folder of data set cape"):
         find_outfit(root, "cape", "tiny")
-    with pytest.raises(AvatarError, match="split: expected train or test"):
+    with pytest.raises(AvatarError, match="split: expected train, test or interpolation"):
         outfit.frames("val")
     with pytest.raises(AvatarError, match=r"no train frame 'rise\.00009'; there are rise"):
         outfit.load("train", "rise.00009")

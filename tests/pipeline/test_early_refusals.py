@@ -106,7 +106,9 @@ def test_an_experiment_without_what_its_scores_need(untruthful, idle):
         ExperimentConfig(points=10)
     with pytest.raises(AvatarError, match="points: expected 1,000"):
         DemoConfig(points=10)
-    with pytest.raises(AvatarError, match=r"compare\.splits: expected some of train, test, validation, got tests"):
+    with pytest.raises(
+        AvatarError, match=r"compare\.splits: expected some of train, test, interpolation, validation, got tests"
+    ):
         ExperimentConfig(compare=CompareConfig(splits=("tests",)))
     with pytest.raises(AvatarError, match=r"split\.validation_share: expected above 0"):
         ExperimentConfig(split=SplitConfig(validation_share=0), compare=CompareConfig(splits=("validation",)))

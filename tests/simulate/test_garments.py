@@ -14,7 +14,7 @@ from avatar.simulate.visibility import body_distances
 
 pytest.importorskip("warp")
 
-RIMS = {"trousers": 3, "tee": 4, "shirt": 4, "skirt": 2, "dress": 4, "jacket": 3}
+RIMS = {"trousers": 3, "tee": 4, "shirt": 4, "skirt": 2, "dress": 4, "jacket": 3, "coat": 3, "slacks": 3, "hoodie": 4}
 
 
 def coarse(name: str, index: int) -> GarmentConfig:
@@ -26,7 +26,17 @@ def coarse(name: str, index: int) -> GarmentConfig:
 
 @pytest.mark.parametrize(
     ("name", "index", "shape"),
-    [("tee", 0, "female"), ("tee", 1, "male"), ("shirt", 1, "male"), ("skirt", 0, "female"), ("jacket", 2, "male")],
+    [
+        ("tee", 0, "female"),
+        ("tee", 1, "male"),
+        ("shirt", 1, "male"),
+        ("skirt", 0, "female"),
+        ("jacket", 2, "male"),
+        ("coat", 2, "male"),
+        ("slacks", 0, "female"),
+        ("slacks", 0, "male"),
+        ("hoodie", 1, "female"),
+    ],
 )
 def test_cut_garments_are_clean_and_outside(name, index, shape):
     body = open_body(shape)
@@ -43,7 +53,7 @@ def test_cut_garments_are_clean_and_outside(name, index, shape):
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     shape_factor = 4 * np.sqrt(3) * mesh.area_faces / (sides**2).sum(1)
     assert shape_factor.min() > 0.35  # 1 for an equilateral triangle, 0 for a sliver
-    if config.top is None:  # nothing is left on the face
+    if config.top is None and not config.hood:  # nothing is left on the face
         assert garment.vertices[:, 1].max() < Cutting.of(body).joints["neck"][1] + NECK_FOOT + 0.01
     away = body_distances(body.bind_vertices.numpy(), body.faces.numpy(), garment.vertices, 0.1)
     assert away.min() > config.fabric.thickness - 1e-4
@@ -80,10 +90,33 @@ def test_bad_garments_are_refused(bad):
 
 
 def test_unknown_names_list_the_known():
-    with pytest.raises(AvatarError, match="tee, shirt, skirt, dress, jacket"):
+    with pytest.raises(AvatarError, match="tee, shirt, skirt, dress, jacket, coat, slacks, hoodie"):
         outfit("tuxedo")
     with pytest.raises(AvatarError, match="density"):
         FabricConfig(density=-1.0)
+
+
+def test_edges_are_an_option_and_cling_stays_the_same_to_an_area():
+    coarse, fine = (outfit("dress", edge=edge).garments[0] for edge in (0.0225, 0.01))
+    assert fine.edge == 0.01 and fine.cling / coarse.cling == pytest.approx((0.01 / 0.0225) ** 2)
+    assert [garment.edge for garment in outfit("coat", edge=0.03).garments] == [0.03] * 3
+    with pytest.raises(AvatarError, match="edge: expected"):
+        outfit("dress", edge=0.001)
+
+
+def test_a_hood_covers_the_head_and_leaves_the_face():
+    body = open_body("female")
+    garment, cutting = cut_garment(body, coarse("hoodie", 1)), Cutting.of(body)
+    assert garment.vertices[:, 1].max() > cutting.vertices[:, 1].max()
+    nose = cutting.vertices[np.where(cutting.head > 0.5, cutting.vertices[:, 2], -1).argmax()]
+    assert np.linalg.norm(garment.vertices - nose, axis=1).min() > 0.05
+
+
+def test_wide_legs_stay_apart():
+    body = open_body("female")
+    garment, cutting = cut_garment(body, coarse("slacks", 0)), Cutting.of(body)
+    shins = garment.vertices[garment.vertices[:, 1] < cutting.height(1)]
+    assert 0.003 < np.abs(shins[:, 0]).min() < 0.03 and np.ptp(shins[shins[:, 0] > 0, 0]) > 0.18
 
 
 def test_every_outfit_names_its_garments_once():

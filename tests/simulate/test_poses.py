@@ -1,4 +1,4 @@
-"""Poses: within limits, clear of themselves, repeatable, and test poses of another kind than train poses."""
+"""Poses: within limits, clear of themselves, repeatable, and training poses apart from test poses."""
 
 from functools import cache
 
@@ -10,7 +10,8 @@ from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.simulate.angles import CENTRAL, LIMITS, pose_from_angles
-from avatar.simulate.poses import clear_of_itself, draw_poses, random_angles
+from avatar.simulate.everyday import EVERYDAY, everyday_angles
+from avatar.simulate.poses import APART, KINDS, clear_of_itself, draw_poses, everyday_poses, random_angles
 from avatar.simulate.sequences import SEQUENCES, authored_motion
 
 
@@ -59,7 +60,7 @@ def test_angles_are_held_within_limits():
 
 
 def test_the_same_seed_gives_the_same_poses_and_another_gives_others():
-    for kind in ("train", "test"):
+    for kind in KINDS:
         first, again, other = (draw_poses(16, seed, kind) for seed in (0, 0, 1))
         assert [pose.name for pose in first] == [pose.name for pose in again]
         assert all((a.pose == b.pose).all() for a, b in zip(first, again))
@@ -78,13 +79,42 @@ def test_random_poses_cover_every_degree_of_freedom():
     assert np.corrcoef(flexion, angles["right_knee_flexion"])[0, 1] > 0.1  # a squat bends both
 
 
-def test_test_poses_are_authored_and_near_to_no_train_pose():
-    train = np.stack([pose.pose for pose in draw_poses(60, 0, "train")])
-    test = draw_poses(21, 0, "test")
-    assert {pose.name.split(".")[0] for pose in test} == set(SEQUENCES)
-    assert {pose.name.split(".")[0] for pose in draw_poses(3, 0, "train")} == {"random"}
-    for pose in test:
-        assert np.linalg.norm(train - pose.pose, axis=(1, 2)).min() > 0.4, pose.name
+@pytest.mark.parametrize("seed", [0, 7])
+def test_no_train_pose_is_near_a_frame_of_a_test_motion(seed):
+    train = np.stack([pose.pose for pose in draw_poses(60, seed, "train")])
+    for name, (period, _) in SEQUENCES.items():
+        for pose in authored_motion(name, seconds=period).poses:
+            assert np.linalg.norm(train - pose, axis=(1, 2)).min() > APART, name
+
+
+def test_kinds_are_told_apart_by_their_names():
+    names = {kind: {pose.name.split(".")[0] for pose in draw_poses(21, 0, kind)} for kind in KINDS}
+    assert names == {"train": {"pose"}, "test": set(SEQUENCES), "interpolation": {"random"}}
+
+
+def test_half_of_the_train_poses_are_everyday_ones_in_turn():
+    train = [pose.pose for pose in draw_poses(16, 0, "train")]
+    everyday = [everyday_poses(name, 2, 0) for name in EVERYDAY]
+    for i, pose in enumerate(train[::2]):
+        np.testing.assert_array_equal(pose, everyday[i % len(EVERYDAY)][i // len(EVERYDAY)])
+    random = pose_from_angles(random_angles(32, 0), 32)
+    for pose in train[1::2]:
+        assert (random == pose).all(axis=(1, 2)).sum() == 1
+    fresh = np.stack([pose.pose for pose in draw_poses(8, 0, "interpolation")])
+    assert all(np.abs(fresh - pose).max(axis=(1, 2)).min() > 0.1 for pose in train)
+
+
+@pytest.mark.parametrize("name", EVERYDAY)
+def test_everyday_poses_keep_their_feet_under_a_tilted_pelvis(name):
+    angles = everyday_angles(name, 32, 0)
+    assert np.ptp(angles["pelvis_bend"]) > 10 and np.ptp(angles["pelvis_lean"]) > 5
+    straight = np.stack([angles[f"{side}_knee_flexion"] for side in ("left", "right")]).max(axis=0) < 15
+    assert straight.any() == (name != "sit")
+    for pose in pose_from_angles(angles, 32)[straight][:6]:
+        places = joint_positions(pose)
+        for side in ("left", "right"):  # thighs hang, wherever the pelvis tilts to
+            thigh = places[f"{side}_knee"] - places[f"{side}_hip"]
+            assert -thigh[1] > 0.9 * np.linalg.norm(thigh)
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
@@ -127,7 +157,7 @@ def test_poses_that_touch_themselves_are_found():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: draw_poses(3, 0, "val"), "kind: expected train or test"),
+        (lambda: draw_poses(3, 0, "val"), "kind: expected one of train, test"),
         (lambda: draw_poses(0, 0, "train"), "count: expected at least 1"),
         (lambda: draw_poses(10_000, 0, "test"), "count: expected at most"),
         (lambda: authored_motion("fly"), "name: expected one of walk"),

@@ -14,9 +14,9 @@ from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, write_open
 from avatar.records import Motion
 from avatar.simulate import gates as gates_module
 from avatar.simulate.dressing import Rest, bind_pose, pose_path
-from avatar.simulate.gates import GateConfig, edge_stretch, frame_names, missed, record_frame
+from avatar.simulate.gates import GateConfig, edge_stretch, frames_of, missed, record_frame, record_motion
 from avatar.simulate.memory import history_error, pose_sensitivity
-from avatar.simulate.poses import NamedPose
+from avatar.simulate.poses import KINDS, NamedPose, everyday_poses
 from avatar.simulate.production import FrameLedger, is_sound, subject
 from avatar.simulate.recording import (
     PRESETS,
@@ -34,7 +34,7 @@ POSE = NamedPose("walk.00003", np.full((22, 3), 0.1, np.float32))
     ("changes", "lists"),
     [
         ({"preset": "fast"}, "quick, sample, full, motion"),
-        ({"outfits": ["tee", "tuxedo"]}, "tee, shirt, skirt, dress, jacket"),
+        ({"outfits": ["tee", "tuxedo"]}, "tee, shirt, skirt, dress, jacket, coat"),
         ({"shapes": ["neutral"]}, "female"),
         ({"train": -1}, "at least 0"),
         ({"fps": 0.0}, "positive"),
@@ -47,8 +47,8 @@ def test_wrong_settings_say_what_is_right(changes, lists):
 
 def test_presets_are_as_promised():
     assert len(PRESETS["quick"].outfits) == 1
-    assert (PRESETS["sample"].train, PRESETS["sample"].test) == (60, 20)
-    assert (PRESETS["full"].train, PRESETS["full"].test, len(PRESETS["full"].outfits)) == (300, 100, 5)
+    assert [getattr(PRESETS["sample"], kind) for kind in KINDS] == [60, 20, 10]
+    assert (PRESETS["full"].train, PRESETS["full"].test) == (300, 100)
     assert not set(PRESETS["motion"].train_motions) & set(PRESETS["motion"].test_motions)
 
 
@@ -74,9 +74,11 @@ def test_bodies_from_files_are_of_the_open_topology(tmp_path):
 
 
 def test_settled_poses_follow_preset_and_overrides():
-    poses = settled_poses(SimulateConfig(preset="quick", train=3, test=0))
+    poses = settled_poses(SimulateConfig(preset="quick", train=3, test=0, interpolation=0))
     assert list(poses) == ["train"] and len(poses["train"]) == 3
-    given = settled_poses(SimulateConfig(train=4, test=2, train_motions=["walk"], test_motions=["kick"], seconds=1.0))
+    given = settled_poses(
+        SimulateConfig(train=4, test=2, interpolation=0, train_motions=["walk"], test_motions=["kick"], seconds=1.0)
+    )
     assert [pose.name.split(".")[0] for pose in given["train"] + given["test"]] == ["walk"] * 4 + ["kick"] * 2
 
 
@@ -203,11 +205,32 @@ def test_finished_frames_are_known_by_hash_and_those_of_older_versions_taken_ove
     assert not FrameLedger(tmp_path, 3).has(path, POSE.pose + 0.1)
     write_open_frame(path, replace(frame, cloth=cloth + 0.01))  # sound, and not what was finished
     assert not FrameLedger(tmp_path, 3).has(path, POSE.pose)
-    FrameLedger(tmp_path, 3).note_all([(path, POSE.pose), (path.with_name("refused.npz"), POSE.pose)])
+    assert not FrameLedger(tmp_path, 3).has(path, POSE.pose, history=2)
+    FrameLedger(tmp_path, 3).note(path, POSE.pose)
+    FrameLedger(tmp_path, 3).note(path.with_name("refused.npz"), POSE.pose)
     assert FrameLedger(tmp_path, 3).has(path, POSE.pose)
     assert not FrameLedger(tmp_path, 3).has(path.with_name("refused.npz"), POSE.pose)
 
 
 def test_frame_names_count_from_zero():
     motion = Motion(np.zeros((2, 22, 3)), np.zeros((2, 3)), 30.0, "kick")
-    assert frame_names(motion) == ["kick.00000", "kick.00001"]
+    assert [frame.name for frame in frames_of(motion)] == ["kick.00000", "kick.00001"]
+
+
+def test_frames_of_a_sequence_say_how_many_went_before(tmp_path, examined):
+    dressed = fake_dressed([])
+    dressed.play = lambda poses: np.stack([dressed.garments[0].vertices] * len(poses))
+    motion = Motion(np.zeros((3, 22, 3), np.float32), np.zeros((3, 3)), 30.0, "kick")
+    assert len(record_motion(dressed, motion, tmp_path, GateConfig())) == 3
+    found = [read_open_frame(tmp_path / f"kick.{frame:05d}.npz").history for frame in range(3)]
+    assert found == [0, 1, 2]
+    assert is_sound(tmp_path / "kick.00002.npz", motion.poses[2], 3, history=2)
+    assert not is_sound(tmp_path / "kick.00002.npz", motion.poses[2], 3)
+
+
+def test_everyday_sequences_pass_their_poses_smoothly():
+    motion = load_motion("stride", 10.0, 2.5, 3)
+    assert motion.poses.shape == (25, 22, 3) and motion.name == "stride"
+    stops = everyday_poses("stride", 3, 3)
+    np.testing.assert_allclose(motion.poses[[0, 10, 20]], stops, atol=1e-5)
+    assert np.abs(np.diff(motion.poses, axis=0)).max() < 0.3

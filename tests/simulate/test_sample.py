@@ -24,7 +24,7 @@ def test_sample_is_complete_and_unchanged(name):
     check_manifest(SAMPLE / name, verify_hashes=True)
     settings = yaml.safe_load((SAMPLE / name / "outfit.yaml").read_text(encoding="utf-8"))
     assert settings["body"] == {"model": "open", "shape": DEFAULT_SHAPES[name], "canonical": "t"}
-    for split, count in (("train", 60), ("test", 20)):
+    for split, count in (("train", 60), ("test", 20), ("interpolation", 10)):
         expected = {pose.name for pose in draw_poses(count, 0, split)}
         found = {path.stem for path in (SAMPLE / name / split).iterdir()}
         assert found <= expected and len(found) >= 0.95 * count
