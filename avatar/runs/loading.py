@@ -10,8 +10,7 @@ from torch import Tensor
 from avatar.body.packed import read_template
 from avatar.checks import AvatarError, DataError
 from avatar.environment import choose_device
-from avatar.io.building import building
-from avatar.io.checkpoints import load_checkpoint, read_weights
+from avatar.io.checkpoints import building, load_checkpoint, read_weights
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.registry import find_method
 from avatar.methods.settings import RunConfig
