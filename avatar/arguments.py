@@ -40,8 +40,12 @@ def tidy_arguments(
     Raises:
         AvatarError: for flags there are not and words that are no option, with the form to write instead.
     """
+
+    def refuse(message: str) -> None:
+        raise AvatarError(message[:1].lower() + message[1:] + ".")
+
     parser = get_args_parser()
-    parser.error = _refuse_arguments
+    parser.error = refuse
     known, unknown = parser.parse_known_intermixed_args(arguments)
     if unknown:
         flag, _, value = unknown[0].partition("=")
@@ -60,11 +64,6 @@ def tidy_arguments(
     for option in options:
         _check_option(option, several)
     return [*flags, *options]
-
-
-def _refuse_arguments(message: str) -> None:
-    """The parser's errors as ours."""
-    raise AvatarError(message[:1].lower() + message[1:] + ".")
 
 
 def _joined(words: list[str], texts: Mapping[str, TextOption]) -> Iterator[str]:
@@ -187,19 +186,10 @@ def refuse_code(arguments: list[str]) -> None:
         parser.add_argument(*names, dest="folders", action="append", default=[], type=Path)
     for folder in parser.parse_known_args(arguments)[0].folders:
         for path in sorted(folder.rglob("*.y*ml")):
-            refuse_machinery(path, path.relative_to(folder))
-
-
-def refuse_machinery(path: Path, name: Path) -> None:
-    """Refuses a configuration file that speaks of Hydra's own options, of objects, or of the environment.
-
-    Raises:
-        DataError: naming the file and the word in it.
-    """
-    read_yaml(path)
-    text = path.read_text(encoding="utf-8")
-    headers = [line for line in text.splitlines() if "@package" in line]
-    for word in (*check_events(path, text), *headers, str(name)):
-        if any(sign in word for sign in ("hydra", "_target_", "()")) or re.search(r"\$\{[^}]*:", word):
-            hint = "Options of verbs are all that a configuration from elsewhere may set."
-            raise DataError(path, f"{word!r:.100} could run code or read the environment: not read.", hint)
+            read_yaml(path)
+            text = path.read_text(encoding="utf-8")
+            headers = [line for line in text.splitlines() if "@package" in line]
+            for word in (*check_events(path, text), *headers, str(path.relative_to(folder))):
+                if any(sign in word for sign in ("hydra", "_target_", "()")) or re.search(r"\$\{[^}]*:", word):
+                    hint = "Options of verbs are all that a configuration from elsewhere may set."
+                    raise DataError(path, f"{word!r:.100} could run code or read the environment: not read.", hint)

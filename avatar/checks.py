@@ -139,6 +139,55 @@ def check_finite(name: str, value: Any) -> None:
         )
 
 
+def check_oriented(points: Any, normals: Any) -> dict[str, int]:
+    """Checks points and normals ``(N, 3)`` for their shapes and finite values; gives N.
+
+    Raises:
+        AvatarError: naming the argument.
+    """
+    dims = check_shape("points", points, "N 3")
+    check_shape("normals", normals, "N 3", **dims)
+    check_finite("points", points)
+    check_finite("normals", normals)
+    return dims
+
+
+def check_faces(faces: np.ndarray, count: int) -> None:
+    """Checks triangles ``(F, 3)``: at least one, of whole numbers, all indices of ``count`` vertices.
+
+    Raises:
+        AvatarError: with what was expected.
+    """
+    check_shape("faces", faces, "F 3")
+    if not len(faces) or not np.issubdtype(faces.dtype, np.integer):
+        raise AvatarError(f"faces: expected triangles of whole numbers, got {len(faces)} of {faces.dtype}.")
+    if faces.min() < 0 or faces.max() >= count:
+        raise AvatarError(f"faces: expected indices in [0, {count}), got {faces.min()} to {faces.max()}.")
+
+
+def check_suffix(path: Path, endings: Iterable[str], what: str) -> str:
+    """The ending of a file's name in lower case.
+
+    Raises:
+        DataError: for one that is none of ``endings``.
+    """
+    if path.suffix.lower() not in endings:
+        raise DataError(path, f"expected {what} ending in {', '.join(endings)}, got {path.suffix!r}.")
+    return path.suffix.lower()
+
+
+def check_file(path: Path, limit: int) -> None:
+    """Refuses a file before it is read.
+
+    Raises:
+        DataError: for one that is missing or larger than ``limit`` bytes.
+    """
+    if not path.is_file():
+        raise DataError(path, "there is no such file.")
+    if path.stat().st_size > limit:
+        raise DataError(path, f"expected at most {limit} bytes, got {path.stat().st_size}.")
+
+
 def require(package: str) -> ModuleType:
     """Imports an optional package at the place of its use.
 

@@ -95,21 +95,17 @@ def start(name: str, verb: Verb) -> None:
         package = (error.name or "").partition(".")[0]
         if package not in CORE:
             raise
-        sys.exit(refuse(name, missing_package(package, error)))
+        message = f"{package} cannot be imported ({error}). Run: {command_line('doctor')}"
+        if isinstance(error, ModuleNotFoundError):
+            hint = environment_hint() or f" Run: {install_line(package)}"
+            message = f"{package} is not installed for {sys.executable}.{hint}"
+        sys.exit(refuse(name, message))
 
 
 def refuse(name: str, message: object) -> int:
     """Prints why a verb does not do what it was asked to; gives the exit code for it."""
     print(f"{name}: {message}", file=sys.stderr)
     return 2
-
-
-def missing_package(package: str, error: ImportError) -> str:
-    """What to say of a package that cannot be imported, with the line to run."""
-    if not isinstance(error, ModuleNotFoundError):
-        return f"{package} cannot be imported ({error}). Run: {command_line('doctor')}"
-    hint = environment_hint() or f" Run: {install_line(package)}"
-    return f"{package} is not installed for {sys.executable}.{hint}"
 
 
 def environment_hint() -> str:

@@ -50,11 +50,6 @@ Settings = TypeVar("Settings")
 report = logging.getLogger(__name__)
 
 
-def settings_class(verb: Verb) -> type:
-    """The class of a verb's settings."""
-    return resolve(verb.settings)
-
-
 def register(name: str, verb: Verb | None = None) -> None:
     """Stores the defaults of a verb's settings, and of all methods' where it takes one, under ``<name>_defaults``.
 
@@ -86,7 +81,7 @@ def compose_settings(name: str, *overrides: str, verb: Verb | None = None) -> An
     register(name, verb)
     running = GlobalHydra.instance().is_initialized()
     with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return to_settings(settings_class(verb), hydra.compose(name, list(overrides)))
+        return to_settings(resolve(verb.settings), hydra.compose(name, list(overrides)))
 
 
 def compose_run(options: list[str]) -> Any:
@@ -159,7 +154,7 @@ def conclude(name: str, verb: Verb, outcomes: list[Outcome]) -> int:
     code = 2 if states else 0
     finished = [outcome.settings for outcome in outcomes if outcome.state == State.finished.value]
     if verb.then and finished:
-        jobs = [settings_from_dict(settings_class(verb), settings) for settings in finished]
+        jobs = [settings_from_dict(resolve(verb.settings), settings) for settings in finished]
         try:
             report.info("%s: %s", name, resolve(verb.then)(jobs))
         except AvatarError as error:
@@ -194,10 +189,11 @@ def run_job(
     if several:
         note_outcome(journal, job.job.num, line, State.running)
     try:
-        check_early(to_settings(declared(verb.settings), config))
+        if isinstance(trained := getattr(to_settings(declared(verb.settings), config), "run", None), Path):
+            check_trained(trained / "avatar")  # a run that is not there is refused before its verb is imported
         leaving = (signal.SIGINT, signal.SIGTERM) if os.getpid() == parent else ()
         with listening(leave_at_once(name), leaving):
-            settings, run = to_settings(settings_class(verb), config), run or resolve(verb.run)
+            settings, run = to_settings(resolve(verb.settings), config), run or resolve(verb.run)
         with leave_when_asked(), prepared_process():
             WORK.clear()
             started = time.monotonic()
@@ -225,16 +221,6 @@ def run_job(
     if several:
         note_outcome(journal, job.job.num, line, State.finished, settings=settings_to_dict(settings))
     return None
-
-
-def check_early(settings: Any) -> None:
-    """Refuses a run that is not there before its verb is imported.
-
-    Raises:
-        DataError: naming the file that is missing.
-    """
-    if isinstance(run := getattr(settings, "run", None), Path):
-        check_trained(run / "avatar")
 
 
 class Lines(logging.StreamHandler):

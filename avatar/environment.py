@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 FIRST_PROCESS = os.getpid()  # that this module was imported in; any other is a fork of it
 report = logging.getLogger(__name__)
 
-
 APT_PACKAGES = {
     "libusb-1.0": "libusb-1.0-0",
     "libGL.so": "libgl1",
@@ -65,11 +64,8 @@ def inspect_machine() -> list[Finding]:
     findings = [Finding("python", sys.version_info >= (3, 11), version, "install Python 3.11 or newer")]
     findings += [inspect_package(name, "core", needed=True) for name in CORE]
     findings += [inspect_package(name, use, needed=False) for name, use in OPTIONAL.items()]
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    findings.append(
-        Finding("chromium", bool(browser), browser or "not found", "apt-get install -y chromium", needed=False)
-    )
-    return findings
+    browser, hint = shutil.which("chromium") or shutil.which("google-chrome"), "apt-get install -y chromium"
+    return [*findings, Finding("chromium", bool(browser), browser or "not found", hint, needed=False)]
 
 
 def inspect_package(name: str, use: str, needed: bool) -> Finding:
@@ -141,19 +137,13 @@ def prepared_process() -> Iterator[None]:
     """
     warn_once_of_early_torch()
     keep_freed_memory()
-    before = flushes_denormals()
+    before = sys.float_info.min / 2 == 0  # whether this thread takes such numbers for zero already
     flush_denormals(True)
     try:
         yield
     finally:
         if not before:
             flush_denormals(False)
-
-
-def flushes_denormals() -> bool:
-    """Whether this thread takes numbers too small for full precision for zero."""
-    smallest = sys.float_info.min
-    return smallest / 2 == 0
 
 
 def flush_denormals(on: bool) -> None:

@@ -40,7 +40,10 @@ def help_text(name: str, verb: Verb, overrides: list[str], conf: Path) -> str:
     options, choices = known_options(name, overrides, conf)
     known = meanings(declared(verb.settings), options)
     main = [(option, *main_option(option, options, choices, known, conf)) for option in verb.options.split()]
-    files = [line for group in choices for line in choice_lines(group, conf)]
+    files = []
+    for group in choices:
+        paths = sorted((conf / group.partition("@")[0]).glob("*.yaml"))
+        files += [f"  {group}=", *(f"  {line}" for line in columns([(path.stem, description(path)) for path in paths]))]
     return "\n".join(
         [
             f"usage: {command_line(name)} [OPTION=VALUE ...]",
@@ -73,13 +76,13 @@ def meanings(kind: type, options: dict[str, Any], prefix: str = "") -> dict[str,
     """What each option of a settings class means, by its full name; those of the chosen method are among them."""
     hints, own, found = get_type_hints(kind), comments(kind), {}
     for name, value in options.items():
-        hint = next((part for part in (hints.get(name), *get_args(hints.get(name))) if is_dataclass(part)), None)
+        parts = (hints.get(name), *get_args(hints.get(name)))
+        hint = next(filter(is_dataclass, parts), None)
         if name == "settings" and (settings := method_settings().get(options.get("name", ""))):
             hint = declared(settings)
         summary = (hint.__doc__ or "").partition("\n")[0] if hint else ""
         shared = "" if prefix else SHARED.get(name)
-        kinds = [part for part in (hints.get(name), *get_args(hints.get(name))) if isinstance(part, EnumType)]
-        values = ", ".join(str(member.value) for kind in kinds for member in kind)
+        values = ", ".join(str(member.value) for kind in parts if isinstance(kind, EnumType) for member in kind)
         found[f"{prefix}{name}"] = "; ".join(filter(None, [own.get(name) or summary or shared, values]))
         if hint and isinstance(value, dict):
             found |= meanings(hint, value, f"{prefix}{name}.")
@@ -91,12 +94,6 @@ def description(path: Path) -> str:
     lines = path.read_text(encoding="utf-8").splitlines()
     said = [line.lstrip("# ") for line in lines if line.startswith("# ") and not line.startswith(("# @", "# python"))]
     return re.split(r"\.(?:\s|$)", " ".join(said), maxsplit=1)[0]
-
-
-def choice_lines(group: str, conf: Path) -> list[str]:
-    """The files of a group, a line each."""
-    named = [(path.stem, description(path)) for path in sorted((conf / group.partition("@")[0]).glob("*.yaml"))]
-    return [f"  {group}=", *(f"  {line}" for line in columns(named))]
 
 
 def columns(rows: list[tuple[str, str]]) -> list[str]:

@@ -6,7 +6,8 @@ import argparse
 import inspect
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,17 @@ def parser_of(verb: Callable[[], None]) -> argparse.ArgumentParser:
     """A parser of a verb's arguments that describes it by its docstring."""
     text = inspect.cleandoc(verb.__doc__ or "")
     return argparse.ArgumentParser(verb.__name__, description=text, formatter_class=argparse.RawTextHelpFormatter)
+
+
+@contextmanager
+def refusals(name: str) -> Iterator[None]:
+    """Ends the program with one line where the arguments of a verb are refused."""
+    from avatar.checks import AvatarError
+
+    try:
+        yield
+    except AvatarError as error:
+        sys.exit(refuse(name, error))
 
 
 def path(text: str) -> Path:
@@ -60,12 +72,9 @@ def convert_body() -> None:
     paths = parser.parse_args()
 
     from avatar.body.smpl import convert_body_model
-    from avatar.checks import AvatarError
 
-    try:
+    with refusals("convert_body"):
         kind = convert_body_model(paths.source, paths.target, paths.uv)
-    except AvatarError as error:
-        sys.exit(refuse("convert_body", error))
     print(f"{paths.target}: {kind} body, {paths.target.stat().st_size / 1e6:.1f} MB")
     name = json.dumps(str(paths.target.resolve()), ensure_ascii=False)
     print(f"Name it in the outfit.yaml of packed data (docs/data.md), as body: {{path: {name}}}")
@@ -85,13 +94,10 @@ def make_body() -> None:
 
     from avatar.body.anny import Phenotype, anny_body
     from avatar.body.packed import write_body
-    from avatar.checks import AvatarError
 
-    try:
+    with refusals("make_body"):
         body = anny_body(Phenotype(**options))
         write_body(target, body)
-    except AvatarError as error:
-        sys.exit(refuse("make_body", error))
     height = float(body.template.vertices[:, 1].max() - body.template.vertices[:, 1].min())
     print(f"{target}: {len(body.template.vertices):,} vertices, {height:.2f} m tall")
 
@@ -109,15 +115,12 @@ def make_motion() -> None:
     parser.add_argument("--fps", type=float, default=30.0)
     options = parser.parse_args()
 
-    from avatar.checks import AvatarError
     from avatar.io.motions import write_motion
     from avatar.simulate.sequences import authored_motion
 
-    try:
+    with refusals("make_motion"):
         motion = authored_motion(options.name, options.fps, options.seconds)
         write_motion(options.target, motion)
-    except AvatarError as error:
-        sys.exit(refuse("make_motion", error))
     print(f"{options.target}: {len(motion.poses)} frames, {options.fps:g} a second")
 
 
@@ -131,15 +134,12 @@ def pack() -> None:
     parser.add_argument("target", type=path, help="the folder to write")
     paths = parser.parse_args()
 
-    from avatar.checks import AvatarError
     from avatar.data.layouts import open_outfit_folder
     from avatar.data.outfits import SPLITS
     from avatar.data.packed_layout import write_packed_outfit
 
-    try:
+    with refusals("pack"):
         packed = write_packed_outfit(open_outfit_folder(paths.source), paths.target)
-    except AvatarError as error:
-        sys.exit(refuse("pack", error))
     count = sum(len(packed.frames(split)) for split in SPLITS if packed.has_frames(split))
     where = {"dataset": paths.target.parent.name, "outfit": paths.target.name, "data_root": paths.target.parent.parent}
     print(f"{paths.target}: {count} frames")

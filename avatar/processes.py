@@ -26,17 +26,6 @@ def interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def end_with_parent() -> None:
-    """Has this worker process end as soon as the process that started it is gone, however it went."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def in_workers(
     work: Callable[..., Any],
     jobs: Iterable[tuple[Any, ...]],
@@ -67,6 +56,13 @@ def in_workers(
 
 
 def _begin_work(prepare: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
-    end_with_parent()
+    """Prepares a worker, which ends as soon as the process that started it is gone, however it went."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
     if prepare is not None:
         prepare(*arguments)

@@ -14,11 +14,11 @@ from hydra.errors import HydraException
 
 from avatar.arguments import refuse_code
 from avatar.checks import AvatarError, DataError
-from avatar.config import CONF, settings_class
+from avatar.config import CONF
 from avatar.config import compose_settings as load
 from avatar.methods.registry import find_method
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.verbs import VERBS
+from avatar.verbs import VERBS, resolve
 from benchmarks import BENCH
 from reliability import CHECK_RELIABILITY
 
@@ -33,7 +33,7 @@ WITH_SETTINGS |= {"bench": BENCH, "check_reliability": CHECK_RELIABILITY}
 @pytest.mark.parametrize("name", WITH_SETTINGS)
 def test_every_verb_composes_and_has_its_tool(name):
     verb = WITH_SETTINGS[name]
-    assert type(load(name, verb=verb)) is settings_class(verb)
+    assert type(load(name, verb=verb)) is resolve(verb.settings)
     assert (ROOT / "tools" / f"{name}.py").is_file()
     assert (verb.conf or CONF / f"{name}.yaml").read_text().startswith(f"# python tools/{name}.py")
 
@@ -45,7 +45,7 @@ def test_no_option_of_a_verb_is_taken_for_a_choice_among_files(name):
     defaults = yaml.safe_load((verb.conf or CONF / f"{name}.yaml").read_text())["defaults"]
     chosen = {str(key) for entry in defaults for key in entry}
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
-    assert groups & settings_to_dict(settings_class(verb)()).keys() <= chosen
+    assert groups & settings_to_dict(resolve(verb.settings)()).keys() <= chosen
 
 
 @pytest.mark.parametrize("name", WITH_SETTINGS)

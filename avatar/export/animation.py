@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
+from avatar.checks import AvatarError, check_oriented, check_shape, check_suffix, require
 from avatar.export.drawing import disc_radii
 from avatar.io.meshes import check_mesh
 from avatar.io.npz import write_whole
@@ -44,10 +44,7 @@ def write_usd_points(
         prim.SetNormalsInterpolation(usd_geom.Tokens.vertex)
 
         def sample(cloud: PointCloud, frame: int) -> None:
-            dims = check_shape("points", cloud.points, "N 3")
-            check_shape("normals", cloud.normals, "N 3", **dims)
-            check_finite("points", cloud.points)
-            check_finite("normals", cloud.normals)
+            check_oriented(cloud.points, cloud.normals)
             widths = 2 * disc_radii(np.asarray(cloud.points, np.float64))
             prim.GetPointsAttr().Set(_vectors(vt, cloud.points), frame)
             prim.GetNormalsAttr().Set(_vectors(vt, cloud.normals), frame)
@@ -101,13 +98,12 @@ def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float, frame
 def _write_usd(path: str | Path, items: Iterable, fps: float, frames: Sequence[int] | None, define: Callable) -> None:
     """The stage around the samples: units, axes, time; whole or not at all."""
     path = Path(path)
-    if path.suffix.lower() not in USD_FORMATS:
-        raise DataError(path, f"expected a USD file ending in {', '.join(USD_FORMATS)}, got {path.suffix!r}.")
+    suffix = check_suffix(path, USD_FORMATS, "a USD file")
     _check_fps(fps)
     usd, usd_geom = require("pxr.Usd"), require("pxr.UsdGeom")
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent) as folder:
-        partial = Path(folder) / f"stage{path.suffix.lower()}"
+        partial = Path(folder) / f"stage{suffix}"
         stage = usd.Stage.CreateNew(str(partial))
         usd_geom.SetStageUpAxis(stage, usd_geom.Tokens.y)
         usd_geom.SetStageMetersPerUnit(stage, 1.0)
@@ -175,8 +171,7 @@ def write_animation(
         DataError: for another file name ending.
     """
     path = Path(path)
-    if path.suffix.lower() not in PICTURE_FORMATS:
-        raise DataError(path, f"expected a film ending in {', '.join(PICTURE_FORMATS)}, got {path.suffix!r}.")
+    suffix = check_suffix(path, PICTURE_FORMATS, "a film")
     _check_fps(fps)
     if not len(images):
         raise AvatarError("images: expected at least one picture, got none.")
@@ -185,13 +180,13 @@ def write_animation(
         check_shape("images", picture, f"{height} {width} 3")
     numbers = [number for number, _ in _numbered(images, frames)]
     pictures = [require("PIL.Image").fromarray(np.ascontiguousarray(picture, np.uint8)) for picture in images]
-    kind = PICTURE_FORMATS[path.suffix.lower()]
+    kind = PICTURE_FORMATS[suffix]
     if kind == "GIF":
         pictures = [picture.quantize(255, dither=0) for picture in pictures]
     tick = 10 if kind == "GIF" else 1  # ms
     ticks = np.rint((np.array([*numbers, numbers[-1] + 1]) - numbers[0]) * 1000 / fps / tick).astype(int)
     durations = [max(int(count), 1) * tick for count in np.diff(ticks)]
     with tempfile.TemporaryDirectory() as folder:
-        film = Path(folder) / f"film{path.suffix.lower()}"
+        film = Path(folder) / f"film{suffix}"
         pictures[0].save(film, kind, save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=85)
         write_whole(path, film.read_bytes())

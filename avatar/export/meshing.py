@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_oriented
 from avatar.export.poisson import FAILED, READY, SOLVED, serve
 from avatar.export.trimming import trim_surface
 from avatar.invocation import install_line
@@ -186,10 +186,7 @@ def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndar
         MeshingError: naming the reason.
     """
     try:
-        dims = check_shape("points", cloud.points, "N 3")
-        check_shape("normals", cloud.normals, "N 3", **dims)
-        check_finite("points", cloud.points)
-        check_finite("normals", cloud.normals)
+        dims = check_oriented(cloud.points, cloud.normals)
     except AvatarError as error:
         raise MeshingError(str(error)) from error
     if dims["N"] > max_points:

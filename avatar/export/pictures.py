@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
+from avatar.checks import AvatarError, check_finite, check_oriented, check_shape, check_suffix, require
 from avatar.export.drawing import (
     BACKGROUND,
     DISC_CORNERS,
@@ -20,6 +21,7 @@ from avatar.export.drawing import (
     load_pyvista,
     shade,
 )
+from avatar.geometry.surface import vertex_normals
 from avatar.io.meshes import check_mesh
 from avatar.io.npz import write_whole
 from avatar.records import Mesh, PointCloud
@@ -51,11 +53,8 @@ def render_points(
     Raises:
         AvatarError: on wrong shapes, non-finite values, or when pictures cannot be made on this machine.
     """
-    dims = check_shape("points", cloud.points, "N 3")
-    check_shape("normals", cloud.normals, "N 3", **dims)
+    check_oriented(cloud.points, cloud.normals)
     points, normals = (np.asarray(values, np.float64) for values in (cloud.points, cloud.normals))
-    check_finite("points", points)
-    check_finite("normals", normals)
     camera = camera or frame_camera(points)
     facing = normals @ camera.axes[2]
     shades = shade(np.where(facing[:, None] < 0, -normals, normals), colors, camera)
@@ -84,8 +83,9 @@ def render_mesh(mesh: Mesh, camera: Camera | None = None, colors: str | tuple | 
     camera = camera or frame_camera(mesh.vertices)
     if colors is None:
         colors = CLAY if mesh.colors is None else mesh.colors
-    normals = _vertex_normals(mesh)
-    surface = load_pyvista().PolyData.from_regular_faces(mesh.vertices.astype(np.float64), mesh.faces)
+    vertices = np.asarray(mesh.vertices, np.float64)
+    normals = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(mesh.faces)).numpy()
+    surface = load_pyvista().PolyData.from_regular_faces(vertices, mesh.faces)
     outside, inside = shade(normals, colors, camera), shade(-normals, colors, camera) * BACK_FACE
     return draw([(surface, outside, "back"), (surface.copy(), inside, "front")], camera)
 
@@ -122,16 +122,6 @@ def map_colors(values: np.ndarray, colormap: str = "turbo") -> np.ndarray:
     if colormap not in maps:
         raise AvatarError(f"colormap: expected a name known to matplotlib (turbo, viridis), got {colormap!r}.")
     return maps[colormap](np.clip(values, 0, 1))[..., :3]
-
-
-def _vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Area-weighted unit normals ``(V, 3)``, zero where undefined."""
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
-    crosses = np.cross(b - a, c - a)
-    normals = np.zeros((len(mesh.vertices), 3))
-    for axis in range(3):
-        normals[:, axis] = np.bincount(mesh.faces.reshape(-1), crosses[:, axis].repeat(3), minlength=len(normals))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
 def contact_sheet(
@@ -200,12 +190,11 @@ def color_bar(max_error: float, height: int = 960, colormap: str = "turbo") -> n
 def save_picture(path: str | Path, picture: np.ndarray) -> None:
     """Writes a ``(H, W, 3)`` uint8 picture as PNG or JPEG, whole or not at all; equal pictures, equal bytes."""
     path = Path(path)
-    if path.suffix.lower() not in PICTURE_FORMATS:
-        raise DataError(path, f"expected a picture ending in {', '.join(PICTURE_FORMATS)}, got {path.suffix!r}.")
+    kind = PICTURE_FORMATS[check_suffix(path, PICTURE_FORMATS, "a picture")]
     _check_picture("picture", picture)
     encoded = io.BytesIO()
     image = require("PIL.Image").fromarray(picture)
-    image.save(encoded, format=PICTURE_FORMATS[path.suffix.lower()], quality=92)
+    image.save(encoded, format=kind, quality=92)
     write_whole(path, encoded.getvalue())
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from avatar.body.model import BodyModel
-from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
+from avatar.checks import AvatarError, check_finite, check_shape, check_suffix, require
 from avatar.geometry.surface import vertex_normals
 from avatar.io.npz import write_whole
 from avatar.records import Motion
@@ -39,8 +39,7 @@ def write_rigged_glb(path: str | Path, body: BodyModel, motion: Motion | None = 
         DataError: for another file name ending.
     """
     path = Path(path)
-    if path.suffix.lower() != ".glb":
-        raise DataError(path, f"expected a file name ending in .glb, got {path.suffix!r}.")
+    check_suffix(path, (".glb",), "a file name")
     if len(body.parents) > 256:
         raise AvatarError(f"body: expected at most 256 joints, got {len(body.parents)}.")
     gltf = require("pygltflib")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import DataError
+from avatar.checks import DataError, check_file
 
 MAX_BYTES = 256 << 20
 ROUNDING = 1e-5  # how far out of [0, 1] a coordinate may be written and still mean the border
@@ -21,14 +21,6 @@ class MeshAtlas:
 
     uv: np.ndarray
     uv_faces: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Corner:
-    """A corner of a polygon: its vertex, and its place in the atlas or None."""
-
-    vertex: int
-    place: int | None
 
 
 def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAtlas | None:
@@ -50,13 +42,12 @@ def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAt
             coordinates out of [0, 1].
     """
     path = Path(path)
-    if not path.is_file():
-        raise DataError(path, "there is no such file.")
-    if path.stat().st_size > MAX_BYTES:
-        raise DataError(path, f"expected an OBJ of at most {MAX_BYTES} bytes, got {path.stat().st_size}.")
+    check_file(path, MAX_BYTES)
     count, places, polygons = 0, [], []
     try:
-        for key, words in _lines(path):
+        lines = re.sub(r"#.*", "", path.read_text(encoding="utf-8"))
+        for line in re.sub(r"\\[ \t]*\n", " ", lines).splitlines():  # what ends in a backslash goes on
+            key, *words = line.split() or [""]
             if key == "v":
                 count += 1
             elif key == "vt":
@@ -78,20 +69,8 @@ def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAt
     return MeshAtlas(np.clip(uv, 0, 1), _match(path, polygons, faces))
 
 
-def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Key and words of the lines of an OBJ file, those ending in a backslash joined with the next."""
-    with path.open(encoding="utf-8") as file:
-        kept = ""
-        for line in file:
-            line = kept + line.partition("#")[0].strip()
-            kept = line[:-1] + " " if line.endswith("\\") else ""
-            words = [] if kept else line.split()
-            if words:
-                yield words[0], words[1:]
-
-
-def _corner(word: str, vertices: int, places: int) -> _Corner:
-    """A corner such as ``12/7/3`` or ``12``; negative numbers count from the last one so far.
+def _corner(word: str, vertices: int, places: int) -> tuple[int, int | None]:
+    """Vertex and place in the atlas of a corner such as ``12/7/3`` or ``12``; negative numbers count from the last.
 
     Raises:
         ValueError: for what is no corner, or points to nothing.
@@ -105,17 +84,17 @@ def _corner(word: str, vertices: int, places: int) -> _Corner:
         found.append(index if number else None)
     if found[0] is None:
         raise ValueError(f"corner {word} has no vertex")
-    return _Corner(found[0], found[1] if len(found) > 1 else None)
+    return found[0], found[1] if len(found) > 1 else None
 
 
-def _match(path: Path, polygons: list[list[_Corner]], faces: np.ndarray) -> np.ndarray:
+def _match(path: Path, polygons: list[list[tuple[int, int | None]]], faces: np.ndarray) -> np.ndarray:
     """The place in the atlas of each corner ``(F, 3)`` of a mesh's triangles."""
     known = {}
     for polygon in polygons:
         if len(polygon) > 4:
             raise DataError(path, f"expected triangles and quads, got a polygon of {len(polygon)} corners.")
         for corners in combinations(polygon, 3):
-            known[frozenset(corner.vertex for corner in corners)] = {c.vertex: c.place for c in corners}
+            known[frozenset(vertex for vertex, _ in corners)] = dict(corners)
     nothing = dict.fromkeys(np.unique(faces).tolist())
     found = [[known.get(frozenset(face), nothing)[vertex] for vertex in face] for face in faces.tolist()]
     bare = [number for number, places in enumerate(found) if None in places]

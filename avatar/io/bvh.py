@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from avatar.checks import DataError
+from avatar.checks import DataError, check_file
 
 MAX_BYTES = 256 << 20
 MAX_JOINTS = 1000
@@ -49,10 +49,7 @@ def read_bvh(path: Path) -> BvhMotion:
         DataError: for a missing, oversized or damaged file, naming what was expected.
     """
     path = Path(path)
-    if not path.is_file():
-        raise DataError(path, "expected a BVH file, there is none.")
-    if path.stat().st_size > MAX_BYTES:
-        raise DataError(path, f"expected at most {MAX_BYTES} bytes, got {path.stat().st_size}.")
+    check_file(path, MAX_BYTES)
     try:
         tokens = path.read_text(encoding="utf-8").split()
         joints, at = _read_hierarchy(tokens)
@@ -62,7 +59,7 @@ def read_bvh(path: Path) -> BvhMotion:
     except IndexError as error:
         raise DataError(path, "expected a whole BVH file, it ends too early.", "Copy it again.") from error
     except ValueError as error:
-        raise DataError(path, f"expected a sound BVH file: {error}.") from error
+        raise DataError(path, f"expected a valid BVH file: {error}.") from error
     rotations, positions = _pose(joints, values)
     names, parents = tuple(joint.name for joint in joints), tuple(joint.parent for joint in joints)
     return BvhMotion(names, parents, np.array([joint.offset for joint in joints]), rotations, positions, fps)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_faces, check_finite, check_shape
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import CanonicalScan
 
@@ -51,15 +51,12 @@ def read_canonical_scan(path: str | Path) -> CanonicalScan:
     """
     path = Path(path)
     required = {
-        "format": "text ",
         "points": "float M 3",
         "normals": "float M 3",
         "weights": "uint16 J M",
         "source": "int M",
     }
-    stored = read_arrays(path, required, {"faces": "int F 3", "colors": "float M 3"})
-    if str(stored["format"]) != FORMAT:
-        raise DataError(path, f"expected format {FORMAT}, got {stored['format']}.", "Canonicalize the scan again.")
+    stored = read_arrays(path, required, {"faces": "int F 3", "colors": "float M 3"}, version=FORMAT)
     weights = stored["weights"].T.astype(np.float32)
     scan = CanonicalScan(
         points=stored["points"],
@@ -97,9 +94,7 @@ def check_canonical_scan(scan: CanonicalScan) -> None:
     if scan.weights.min() < 0 or scan.source.min() < 0 or (np.diff(scan.source) <= 0).any():
         raise AvatarError("weights, source: expected no negative weight and rising indices, got others.")
     if scan.faces is not None:
-        check_shape("faces", scan.faces, "F 3")
-        if not len(scan.faces) or scan.faces.min() < 0 or scan.faces.max() >= dims["M"]:
-            raise AvatarError(f"faces: expected some, with indices in [0, {dims['M']}).")
+        check_faces(scan.faces, dims["M"])
     if scan.colors is not None:
         check_shape("colors", scan.colors, "M 3", **dims)
         check_finite("colors", scan.colors)

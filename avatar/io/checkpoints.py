@@ -10,7 +10,7 @@ import re
 import shutil
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import NoneType
@@ -21,13 +21,18 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from avatar.checks import AvatarError, DataError, check_finite, check_trained
 from avatar.io.documents import read_json
+from avatar.io.ledger import digest_of
 from avatar.io.npz import write_whole
 
 MANIFEST = "manifest.json"
 KEPT = 2
+FACTOR = 4  # times the numbers in a weights file: initialisation makes temporaries of a layer's size
+SPARE = 1 << 22  # numbers beside them, 16 MiB: what a network draws, sorts and caches of its template
+FACTORIES = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.eye}
 NAME = re.compile(r"step-(\d{8,})\.([0-9a-f]{16})\.pt")  # the step, and the first digits of the file's sha256
 
 
@@ -65,9 +70,13 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
         entries["best"] = entry if improved else record
     try:
         write_whole(folder / entry["file"], data)
-        write_whole(folder / MANIFEST, _seal(entries))
+        write_whole(folder / MANIFEST, json.dumps({**entries, "sha256": digest_of(entries)}, indent=1).encode())
     except DataError as error:
-        raise _not_written(folder, error.__cause__, len(data), before) from error
+        free = shutil.disk_usage(folder if folder.is_dir() else ".").free
+        kept = f"step {before['last'][-1]['step']}" if before.get("last") else "none"
+        problem = f"could not write a checkpoint ({getattr(error.__cause__, 'strerror', error.__cause__)}; "
+        problem += f"{len(data):,} bytes needed, {free:,} free). The last one written: {kept}."
+        raise DataError(folder, problem, "Make room and give the same command again.") from error
     listed = {kept["file"] for kept in (*entries["last"], entries.get("best", entry))}
     for path in (*folder.glob("step-*.pt"), *folder.glob(".*.tmp-*")):
         if path.name not in listed:
@@ -88,26 +97,6 @@ def _is_finite(value: Tensor) -> bool:
     return not value.is_floating_point() or bool(torch.isfinite(value).all())
 
 
-def _not_written(folder: Path, error: BaseException | None, needed: int, before: dict[str, Any]) -> DataError:
-    free = shutil.disk_usage(folder if folder.is_dir() else ".").free
-    kept = f"step {before['last'][-1]['step']}" if before.get("last") else "none"
-    return DataError(
-        folder,
-        f"could not write a checkpoint ({getattr(error, 'strerror', error)}; {needed:,} bytes needed, {free:,} free). "
-        f"The last one written: {kept}.",
-        "Make room and give the same command again.",
-    )
-
-
-def _seal(entries: dict[str, Any]) -> bytes:
-    """A manifest with the sha256 of its own entries."""
-    return json.dumps({**entries, "sha256": _digest(entries)}, indent=1).encode()
-
-
-def _digest(entries: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
-
-
 def read_manifest(folder: Path) -> dict[str, Any]:
     """The checkpoints a folder lists: ``last`` (oldest first) and ``best``; empty when there are none.
 
@@ -117,7 +106,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if path.is_file():
         try:
             entries = read_json(path)
-            if entries.pop("sha256", None) == _digest(entries) and _is_listing(entries):
+            if entries.pop("sha256", None) == digest_of(entries) and _is_listing(entries):
                 return entries
         except DataError:
             pass  # not JSON: as damaged as a wrong hash
@@ -126,7 +115,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     for file in sorted(folder.glob("step-*.pt")):
         if match := NAME.fullmatch(file.name):
             entry = {"file": file.name, "step": int(match[1]), "score": None, "sha256": match[2]}
-            state = _read_sound(folder, entry)
+            state = _read_valid(folder, entry)
             found += [] if state is None else [entry | {"score": state["score"]}]
     scored = [entry for entry in found if entry["score"] is not None]
     best = {"best": min(scored, key=lambda entry: (entry["score"], -entry["step"]))} if scored else {}
@@ -137,17 +126,18 @@ def _is_listing(entries: dict[str, Any]) -> bool:
     """Whether a manifest lists checkpoints of its own folder: a seal can be forged, a name could lead elsewhere."""
     last = entries.get("last", [])
     listed = [*last, *([entries["best"]] if "best" in entries else [])] if isinstance(last, list) else [None]
-    for entry in listed:
-        if not isinstance(entry, dict) or not NAME.fullmatch(str(entry.get("file"))):
-            return False
-        if type(entry.get("step")) is not int or not isinstance(entry.get("score"), (int, float, NoneType)):
-            return False
-        if not re.fullmatch("[0-9a-f]{16,64}", str(entry.get("sha256"))):
-            return False
-    return all(entry["score"] is not None for entry in listed[len(last) :])
+    sound = all(
+        isinstance(entry, dict)
+        and NAME.fullmatch(str(entry.get("file")))
+        and type(entry.get("step")) is int
+        and isinstance(entry.get("score"), (int, float, NoneType))
+        and re.fullmatch("[0-9a-f]{16,64}", str(entry.get("sha256")))
+        for entry in listed
+    )
+    return sound and all(entry["score"] is not None for entry in listed[len(last) :])
 
 
-def _read_sound(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
+def _read_valid(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
     """The state of a listed checkpoint; None when its bytes are not those that were written, or no state of ours."""
     path = folder / entry["file"]
     data = path.read_bytes() if path.is_file() else b""
@@ -180,6 +170,38 @@ def restoring(folder: Path) -> Iterator[None]:
         raise DataError(folder, f"its weights or state do not fit this run ({reason:.300}).") from error
 
 
+class Budget(TorchFunctionMode):
+    """Refuses to allocate a tensor larger than a number of elements, for as long as it is entered."""
+
+    def __init__(self, elements: int):
+        super().__init__()
+        self.left = elements
+
+    def __torch_function__(self, function: Any, types: Any, arguments: tuple = (), options: dict | None = None) -> Any:
+        options = options or {}
+        if function in FACTORIES:
+            given = options.get("size", arguments[:1] if function is torch.full else arguments)
+            sizes = [size for part in given for size in (part if isinstance(part, (tuple, list)) else [part])]
+            asked = math.prod(int(size) for size in sizes if isinstance(size, int))
+            self.left -= asked
+            if self.left < 0:
+                raise AvatarError(
+                    f"settings: they ask for a network of {asked} numbers, the weights beside it have less."
+                )
+        return function(*arguments, **options)
+
+
+@contextmanager
+def building(path: Path, weights: Mapping[str, Tensor]) -> Iterator[None]:
+    """Builds and fills a network within a ``with`` block; sizes that its file invents are refused unallocated.
+
+    Raises:
+        DataError: naming the file, when the settings ask for more than the weights hold, or the two do not fit.
+    """
+    with restoring(path), Budget(FACTOR * sum(value.numel() for value in weights.values()) + SPARE):
+        yield
+
+
 def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
     """The resume state of the newest sound checkpoint (``last``) or of the best (``best``); None without any.
 
@@ -193,7 +215,7 @@ def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
     if which == "last":
         listed = list(reversed(entries.get("last", [])))
     for position, entry in enumerate(listed):
-        state = _read_sound(folder, entry)
+        state = _read_valid(folder, entry)
         if state is not None:
             return state
         following = listed[position + 1]["file"] if position + 1 < len(listed) else "nothing"

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from avatar.checks import DataError
+from avatar.checks import DataError, check_file
 
 YAML_BYTES = 1 << 17  # a run's own config.yaml has 5 kB; this many take a second to parse
 JSON_BYTES = 64 << 20
@@ -62,10 +62,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def _read_text(path: Path, limit: int) -> str:
-    if not path.is_file():
-        raise DataError(path, "no such file.")
-    if path.stat().st_size > limit:
-        raise DataError(path, f"expected at most {limit} bytes, got {path.stat().st_size}.")
+    check_file(path, limit)
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_faces, check_finite, check_shape
 from avatar.io.documents import read_json
+from avatar.io.ledger import file_digest
 from avatar.io.npz import read_arrays, write_arrays, write_whole
 
 QUANTUM = 5e-5  # metres: 0.05 mm
@@ -99,7 +99,6 @@ def read_open_frame(path: Path) -> OpenFrame:
     stored = read_arrays(
         path,
         {
-            "format": "text ",
             "pose": "float J 3",
             "translation": "float 3",
             "origin": "float 3",
@@ -112,8 +111,8 @@ def read_open_frame(path: Path) -> OpenFrame:
         },
         {"history": "int "},
         limit=FRAME_BYTES,
+        version=FRAME_FORMAT,
     )
-    _check_format(path, stored, FRAME_FORMAT)
     for key in ("origin", "translation"):
         if np.abs(stored[key]).max() > FARTHEST:
             raise DataError(path, f"{key}: expected metres within {FARTHEST:g} of the origin, got {stored[key]}.")
@@ -140,7 +139,6 @@ def write_open_garment(path: Path, garment: OpenGarment) -> None:
     """Writes an outfit's garment. Raises `AvatarError` on wrong shapes, face indices or labels."""
     dims = check_shape("canonical", garment.canonical, "V 3")
     check_shape("labels", garment.labels, "V", **dims)
-    check_shape("faces", garment.faces, "F 3")
     check_finite("canonical", garment.canonical)
     _check_garment(garment)
     write_arrays(
@@ -157,15 +155,8 @@ def write_open_garment(path: Path, garment: OpenGarment) -> None:
 
 def read_open_garment(path: Path) -> OpenGarment:
     """Reads an outfit's garment; faces come as int64. Raises `DataError` when the file is not sound."""
-    keys = {
-        "format": "text ",
-        "faces": "int F 3",
-        "canonical": "float V 3",
-        "labels": "uint8 V",
-        "names": "text G",
-    }
-    stored = read_arrays(path, keys, limit=FRAME_BYTES)
-    _check_format(path, stored, GARMENT_FORMAT)
+    keys = {"faces": "int F 3", "canonical": "float V 3", "labels": "uint8 V", "names": "text G"}
+    stored = read_arrays(path, keys, limit=FRAME_BYTES, version=GARMENT_FORMAT)
     names = tuple(str(name) for name in stored["names"])
     garment = OpenGarment(stored["faces"].astype(np.int64), stored["canonical"], stored["labels"], names)
     try:
@@ -177,18 +168,10 @@ def read_open_garment(path: Path) -> OpenGarment:
 
 def _check_garment(garment: OpenGarment) -> None:
     """Refuses faces or labels that point at nothing."""
-    faces, labels = np.asarray(garment.faces), np.asarray(garment.labels)
-    if faces.size == 0 or faces.min() < 0 or faces.max() >= len(garment.canonical):
-        raise AvatarError(f"faces: expected vertex indices in [0, {len(garment.canonical)}).")
+    check_faces(np.asarray(garment.faces), len(garment.canonical))
+    labels = np.asarray(garment.labels)
     if labels.min() < 1 or labels.max() > len(garment.names):
         raise AvatarError(f"labels: expected 1 to {len(garment.names)}, one number for each of {garment.names}.")
-
-
-def _check_format(path: Path, stored: dict[str, np.ndarray], expected: str) -> None:
-    """Refuses a file of another format or version."""
-    if str(stored["format"]) != expected:
-        hint = "Make the data again with this version, or use the version that wrote it."
-        raise DataError(path, f"expected format {expected}, got {stored['format']}.", hint)
 
 
 def _listed_files(folder: Path) -> dict[str, Path]:
@@ -202,7 +185,7 @@ def write_manifest(folder: Path) -> Path:
     """Records size and sha256 of a dataset folder's files in its ``manifest.json``; returns its path."""
     folder = Path(folder)
     listed = _listed_files(folder)
-    files = {name: {"size": path.stat().st_size, "sha256": _sha256(path)} for name, path in listed.items()}
+    files = {name: {"size": path.stat().st_size, "sha256": file_digest(path)} for name, path in listed.items()}
     text = json.dumps({"format": MANIFEST_FORMAT, "files": files}, indent=1)
     write_whole(folder / MANIFEST, f"{text}\n".encode())
     return folder / MANIFEST
@@ -233,11 +216,5 @@ def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
         size, digest = known[name]
         if files[name].stat().st_size != size:
             raise DataError(files[name], f"expected {size} bytes, got {files[name].stat().st_size}.", hint)
-        if verify_hashes and _sha256(files[name]) != digest:
+        if verify_hashes and file_digest(files[name]) != digest:
             raise DataError(files[name], "its sha256 is not the manifest's: the content has changed.", hint)
-
-
-def _sha256(path: Path) -> str:
-    """Hex digest of a file's bytes."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

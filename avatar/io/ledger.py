@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.checks import DataError
-from avatar.io.file_locks import lock_file
+from avatar.io.locks import lock_file
 from avatar.progress import WORK
 
 LEDGER = ".finished.jsonl"

@@ -7,12 +7,22 @@ import json
 import re
 import struct
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
+from avatar.checks import (
+    AvatarError,
+    DataError,
+    check_faces,
+    check_file,
+    check_finite,
+    check_shape,
+    check_suffix,
+    require,
+)
 from avatar.io.npz import write_whole
 from avatar.records import Mesh
 
@@ -33,7 +43,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> None:
         DataError: for another file name ending.
     """
     path = Path(path)
-    suffix = _check_suffix(path)
+    suffix = check_suffix(path, FORMATS, "a mesh file")
     with np.errstate(over="ignore"):
         mesh = replace(mesh, vertices=np.asarray(mesh.vertices, np.float32))
     check_mesh(mesh)
@@ -56,11 +66,8 @@ def read_mesh(path: str | Path) -> Mesh:
             triangles, NaN, indices out of range or only triangles without area.
     """
     path = Path(path)
-    suffix = _check_suffix(path)
-    if not path.is_file():
-        raise DataError(path, "there is no such file.")
-    if not 0 < path.stat().st_size <= MAX_BYTES:
-        raise DataError(path, f"expected a file of 1 to {MAX_BYTES} bytes, got {path.stat().st_size}.")
+    suffix = check_suffix(path, FORMATS, "a mesh file")
+    check_file(path, MAX_BYTES)
     data = path.read_bytes()
     largest = _largest_count(suffix, data)
     if largest > min(len(data), 3 * MAX_VERTICES):
@@ -95,17 +102,10 @@ def check_mesh(mesh: Mesh) -> None:
         AvatarError: naming the field and what is wrong.
     """
     dims = check_shape("vertices", mesh.vertices, "V 3")
-    check_shape("faces", mesh.faces, "F 3")
-    if not len(mesh.vertices) or not len(mesh.faces):
-        raise AvatarError(f"mesh: expected triangles, got {len(mesh.vertices)} vertices and {len(mesh.faces)} faces.")
-    if len(mesh.vertices) > MAX_VERTICES:
-        raise AvatarError(f"vertices: expected at most {MAX_VERTICES}, got {len(mesh.vertices)}.")
+    if dims["V"] > MAX_VERTICES:
+        raise AvatarError(f"vertices: expected at most {MAX_VERTICES}, got {dims['V']}.")
     check_finite("vertices", mesh.vertices)
-    if not np.issubdtype(mesh.faces.dtype, np.integer):
-        raise AvatarError(f"faces: expected whole numbers, got {mesh.faces.dtype}.")
-    lowest, highest = int(mesh.faces.min()), int(mesh.faces.max())
-    if lowest < 0 or highest >= dims["V"]:
-        raise AvatarError(f"faces: expected indices in [0, {dims['V']}), got {lowest} to {highest}.")
+    check_faces(mesh.faces, dims["V"])
     a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
     if not (np.cross(b - a, c - a) != 0).any():
         raise AvatarError("faces: expected triangles with area, got none.")
@@ -114,27 +114,16 @@ def check_mesh(mesh: Mesh) -> None:
         check_finite("colors", mesh.colors)
 
 
-def _check_suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        raise DataError(path, f"expected a mesh file ending in {', '.join(FORMATS)}, got {path.suffix!r}.")
-    return suffix
-
-
 def _largest_count(suffix: str, data: bytes) -> int:
     """The largest element count a PLY, OFF or GLB header promises; every element takes at least a byte."""
+    counts = []
     if suffix == ".ply":
         header = data[: data.find(b"end_header") + 1]
         counts = re.findall(rb"^\s*element\s+\S+\s+(\d+)", header, re.MULTILINE)
     elif suffix == ".off":
         counts = re.findall(rb"\d+", re.sub(rb"#[^\n]*", b"", data[:4096]))[:3]
     elif suffix == ".glb" and len(data) >= 20:
-        try:
+        with suppress(ValueError, KeyError, TypeError):  # not sound, which the parser reports
             length = struct.unpack_from("<I", data, 12)[0]
-            accessors = json.loads(data[20 : 20 + length])["accessors"]
-            counts = [int(accessor["count"]) for accessor in accessors]
-        except (ValueError, KeyError, TypeError):
-            counts = []  # not sound, which the parser reports
-    else:
-        counts = []
+            counts = [int(accessor["count"]) for accessor in json.loads(data[20 : 20 + length])["accessors"]]
     return max((int(count) for count in counts), default=0)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from avatar.body.model import SMPL_JOINTS, BodyModel
-from avatar.checks import AvatarError, DataError, check_finite, check_shape, plain_name
+from avatar.checks import AvatarError, DataError, check_finite, check_shape, check_suffix, plain_name
 from avatar.io.bvh import BvhMotion, read_bvh
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.io.retargeting import map_joints, move_body, rest_joints, retarget
@@ -59,9 +59,7 @@ def read_motion(path: Path, fps: float | None = None, up: str | None = None, res
     if up not in (None, "y", "z"):
         raise AvatarError(f"up: expected y, z or nothing, got {up!r}.")
     readers = {".npz": _read_npz, ".bvh": partial(_read_bvh, rest=rest)}
-    if path.suffix.lower() not in readers:
-        raise DataError(path, f"expected a motion file ending in {' or '.join(readers)}, got {path.suffix!r}.")
-    motion = readers[path.suffix.lower()](path, up)
+    motion = readers[check_suffix(path, readers, "a motion file")](path, up)
     low, high = FRAME_RATES
     if len(motion.poses) == 0:
         raise DataError(path, "expected at least one frame, got none.")
@@ -132,10 +130,7 @@ def _read_npz(path: Path, up: str | None) -> Motion:
     """Our own motion or one of the AMASS family."""
     if "format" in read_arrays(path, {}, {"format": "text "}):
         keys = {"poses": f"float T {JOINTS} 3", "translations": "float T 3", "fps": "number ", "name": "text "}
-        keys["format"] = "text "
-        stored = read_arrays(path, keys)
-        if str(stored["format"]) != MOTION_FORMAT:
-            raise DataError(path, f"expected format {MOTION_FORMAT}, got {stored['format']}.")
+        stored = read_arrays(path, keys, version=MOTION_FORMAT)
         motion = Motion(stored["poses"], stored["translations"], float(stored["fps"]), str(stored["name"]))
         return turn_up(motion) if up == "z" else motion
     motion = _read_amass(path)
@@ -144,18 +139,9 @@ def _read_npz(path: Path, up: str | None) -> Motion:
 
 def _read_amass(path: Path) -> Motion:
     """AMASS: ``poses (T, 3 joints)``, or ``root_orient`` and ``pose_body`` of the SMPL-X stage II files."""
-    rate = "number | 1"
-    stored = read_arrays(
-        path,
-        {"trans": "float T 3"},
-        {
-            "poses": "float T P",
-            "root_orient": "float T 3",
-            "pose_body": "float T 63",
-            "mocap_framerate": rate,
-            "mocap_frame_rate": rate,
-        },
-    )
+    poses = {"poses": "float T P", "root_orient": "float T 3", "pose_body": "float T 63"}
+    optional = poses | dict.fromkeys(("mocap_framerate", "mocap_frame_rate"), "number | 1")
+    stored = read_arrays(path, {"trans": "float T 3"}, optional)
     if "root_orient" in stored and "pose_body" in stored:
         poses = np.concatenate([stored["root_orient"], stored["pose_body"]], axis=1)
     elif "poses" in stored and stored["poses"].shape[1] >= 3 * JOINTS and stored["poses"].shape[1] % 3 == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import zipfile
 import zlib
@@ -29,6 +30,7 @@ def read_arrays(
     required: Mapping[str, str],
     optional: Mapping[str, str] | None = None,
     limit: int = SIZE_LIMIT,
+    version: str = "",
 ) -> dict[str, np.ndarray]:
     """Reads named arrays of an npz file; other keys are never decoded, so what they hold does not matter.
 
@@ -41,10 +43,11 @@ def read_arrays(
         required: key to description; all must be there.
         optional: key to description; read where present.
         limit: bytes that all arrays of the file may take unpacked.
+        version: what its text ``format`` must say, where it has one.
 
     Raises:
         DataError: naming file, key, what was expected and what came: missing or damaged file, oversized or
-            pickled members, missing keys, wrong kinds or shapes, NaN or infinite numbers.
+            pickled members, missing keys, another format, wrong kinds or shapes, NaN or infinite numbers.
     """
     path, optional = Path(path), optional or {}
     if not path.is_file():
@@ -52,11 +55,14 @@ def read_arrays(
     try:
         with zipfile.ZipFile(path) as archive:
             members = _members(path, archive, limit)
-            absent = [key for key in required if key not in members]
+            absent = [key for key in ([*required, "format"] if version else required) if key not in members]
             if absent:
                 there = ", ".join(sorted(members)) or "none"
                 raise DataError(path, f"expected the keys {', '.join(absent)}, found only: {there}.")
             dims: dict[str, int] = {}
+            if version and (found := str(_read(path, archive, members["format"], "format", "text ", dims))) != version:
+                hint = "Make the data again with this version, or use the version that wrote it."
+                raise DataError(path, f"expected format {version}, got {found}.", hint)
             wanted = {**required, **{key: optional[key] for key in optional if key in members}}
             return {key: _read(path, archive, members[key], key, wanted[key], dims) for key in wanted}
     except DAMAGED as error:
@@ -126,9 +132,7 @@ def _check_header(path: Path, key: str, shape: tuple, dtype: np.dtype, kind: str
         raise DataError(path, f"{key}: expected {kind}, found Python objects or records: not read.")
     if (dtype.kind not in DTYPE_KINDS[kind]) if kind in DTYPE_KINDS else dtype != np.dtype(kind):
         raise DataError(path, f"{key}: expected {kind}, got {dtype}.")
-    size = dtype.itemsize
-    for length in shape:
-        size *= length
+    size = math.prod(shape, start=dtype.itemsize)
     if any(length < 0 for length in shape) or size != stored:
         raise DataError(path, f"{key}: its header declares {size} bytes of {shape}, the file holds {stored}.")
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_file, check_finite, check_shape, check_suffix
 from avatar.io.npz import write_whole
 from avatar.records import PointCloud
 
@@ -53,7 +52,7 @@ def write_points(path: str | Path, cloud: PointCloud) -> None:
         DataError: when the file name does not end in .ply.
     """
     path = Path(path)
-    _check_suffix(path)
+    check_suffix(path, (".ply",), "a file name")
     dims = check_shape("points", cloud.points, "N 3")
     check_shape("normals", cloud.normals, "N 3", **dims)
     values = np.concatenate([cloud.points, cloud.normals], axis=1).astype("<f4")
@@ -102,11 +101,8 @@ def read_points(path: str | Path) -> PointCloud:
             no normals, non-finite values, normals far from unit length, or colours beyond their range.
     """
     path = Path(path)
-    _check_suffix(path)
-    if not path.is_file():
-        raise DataError(path, "there is no such file.")
-    if path.stat().st_size > MAX_BYTES:
-        raise DataError(path, f"expected at most {MAX_BYTES} bytes, got {path.stat().st_size}.")
+    check_suffix(path, (".ply",), "a file name")
+    check_file(path, MAX_BYTES)
     data = path.read_bytes()
     header = read_ply_header(path, data)
     columns = _wanted_columns(path, header)
@@ -186,18 +182,10 @@ def _read_columns(path: Path, data: bytes, header: PlyHeader, columns: tuple[str
 
 def _read_ascii(path: Path, data: bytes, header: PlyHeader, columns: list[int]) -> np.ndarray:
     """The same from the lines of an ASCII file."""
-    lines = data[header.start :].decode("latin-1").splitlines()[: header.count]
+    lines = [line for line in data[header.start :].decode("latin-1").splitlines() if line.strip()][: header.count]
     if len(lines) < header.count:
         raise DataError(path, f"cut short: the header promises {header.count} vertices, got {len(lines)} lines.")
     try:
-        values = np.loadtxt(io.StringIO("\n".join(lines)), usecols=columns, ndmin=2, comments=None)
+        return np.loadtxt(lines, usecols=columns, ndmin=2, comments=None)
     except ValueError as error:
         raise DataError(path, f"a vertex line cannot be read ({error}).") from error
-    if len(values) != header.count:
-        raise DataError(path, f"the header promises {header.count} vertices, the lines hold {len(values)}.")
-    return values
-
-
-def _check_suffix(path: Path) -> None:
-    if path.suffix.lower() != ".ply":
-        raise DataError(path, f"expected a file name ending in .ply, got {path.suffix!r}.")

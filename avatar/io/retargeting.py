@@ -69,15 +69,10 @@ def retarget(bvh: BvhMotion, name: str, rest: np.ndarray | None = None) -> Motio
         turns = _calibrated_turns(bvh, source, rest)
     else:
         turns = {joint: bvh.rotations[:, index] @ aligned[joint] for joint, index in source.items()}
-    poses = np.zeros((len(bvh.positions), len(SMPL_JOINTS), 3))
-    world = np.zeros((len(bvh.positions), len(SMPL_JOINTS), 3, 3))
-    for joint, parent in enumerate(SMPL_PARENTS):
-        above = world[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), world[:, 0].shape)
-        world[:, joint] = turns.get(joint, above)
-        poses[:, joint] = Rotation.from_matrix(np.swapaxes(above, 1, 2) @ world[:, joint]).as_rotvec()
+    poses = _local_poses(turns, SMPL_PARENTS, len(bvh.positions))
     scale = _leg_length(rest, {j: j for j in source}) / _leg_length(offsets, source)
     translations = scale * bvh.positions[:, source[0]] - rest[0]
-    return Motion(poses.astype(np.float32), translations.astype(np.float32), bvh.fps, name)
+    return Motion(poses, translations.astype(np.float32), bvh.fps, name)
 
 
 def move_body(motion: Motion, body: BodyModel) -> Motion:
@@ -91,15 +86,11 @@ def move_body(motion: Motion, body: BodyModel) -> Motion:
     """
     if body.joint_names == tuple(SMPL_JOINTS) and body.parents == SMPL_PARENTS:
         return motion
-    ours = {theirs: joint for joint, theirs in map_joints(body.joint_names, body.parents).items()}
-    turns = _world_rotations(motion.poses)
-    world = np.zeros((len(motion.poses), len(body.parents), 3, 3))
-    poses = np.zeros((len(motion.poses), len(body.parents), 3), np.float32)
-    for joint, parent in enumerate(body.parents):
-        above = world[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), world[:, 0].shape)
-        world[:, joint] = turns[:, ours[joint]] if joint in ours else above
-        poses[:, joint] = Rotation.from_matrix(np.swapaxes(above, 1, 2) @ world[:, joint]).as_rotvec()
-    return replace(motion, poses=poses)
+    own = Rotation.from_rotvec(motion.poses.reshape(-1, 3)).as_matrix().reshape(*motion.poses.shape, 3)
+    for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
+        own[:, joint] = own[:, parent] @ own[:, joint]
+    turns = {theirs: own[:, joint] for joint, theirs in map_joints(body.joint_names, body.parents).items()}
+    return replace(motion, poses=_local_poses(turns, body.parents, len(motion.poses)))
 
 
 def rest_joints(body: BodyModel) -> np.ndarray:
@@ -146,12 +137,15 @@ def map_joints(names: Sequence[str], parents: Sequence[int]) -> dict[int, int]:
     return dict(sorted(found.items()))
 
 
-def _world_rotations(poses: np.ndarray) -> np.ndarray:
-    """Rotations of our joints in the world ``(T, 22, 3, 3)`` of a motion's poses ``(T, 22, 3)``."""
-    own = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(*poses.shape, 3)
-    for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
-        own[:, joint] = own[:, parent] @ own[:, joint]
-    return own
+def _local_poses(turns: dict[int, np.ndarray], parents: Sequence[int], frames: int) -> np.ndarray:
+    """Poses ``(T, J, 3)`` of world rotations ``(T, 3, 3)`` by joint; joints without one move with their parents."""
+    poses = np.zeros((frames, len(parents), 3), np.float32)
+    world = np.zeros((frames, len(parents), 3, 3))
+    for joint, parent in enumerate(parents):
+        above = world[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), world[:, 0].shape)
+        world[:, joint] = turns.get(joint, above)
+        poses[:, joint] = Rotation.from_matrix(np.swapaxes(above, 1, 2) @ world[:, joint]).as_rotvec()
+    return poses
 
 
 def _mapped_parent(joint: int, source: dict[int, int]) -> int:
@@ -206,14 +200,7 @@ def _align(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
     ours, theirs = (b[known] / np.linalg.norm(b[known], axis=1, keepdims=True) for b in (ours, theirs))
     if len(ours) == 0:
         return np.eye(3)
-    if len(ours) > 1:
-        return Rotation.align_vectors(theirs, ours)[0].as_matrix()
-    axis, cosine = np.cross(ours[0], theirs[0]), float(ours[0] @ theirs[0])
-    if np.linalg.norm(axis) < 1e-9:
-        side = np.cross(ours[0], [1.0, 0.0, 0.0] if abs(ours[0, 0]) < 0.9 else [0.0, 1.0, 0.0])
-        return np.eye(3) if cosine > 0 else Rotation.from_rotvec(np.pi * side / np.linalg.norm(side)).as_matrix()
-    angle = np.arctan2(np.linalg.norm(axis), cosine)
-    return Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle).as_matrix()
+    return Rotation.align_vectors(theirs, ours)[0].as_matrix()
 
 
 def _calibrated_turns(bvh: BvhMotion, source: dict[int, int], rest: np.ndarray) -> dict[int, np.ndarray]:

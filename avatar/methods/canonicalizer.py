@@ -29,8 +29,7 @@ from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
 from avatar.implicit.fields import BodyField
 from avatar.invocation import command_line
-from avatar.io.building import building
-from avatar.io.checkpoints import read_weights
+from avatar.io.checkpoints import building, read_weights
 from avatar.io.documents import read_yaml
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Stage, Task
 from avatar.methods.settings import CANONICALIZERS

@@ -16,8 +16,7 @@ from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
 from avatar.environment import choose_device, prepared_process
-from avatar.io.building import building
-from avatar.io.checkpoints import load_checkpoint, read_weights, write_weights
+from avatar.io.checkpoints import building, load_checkpoint, read_weights, write_weights
 from avatar.io.documents import read_yaml
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole

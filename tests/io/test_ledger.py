@@ -10,8 +10,8 @@ import pytest
 from concurrent_jobs import WAIT, run_at_once
 
 from avatar.checks import DataError
-from avatar.io.file_locks import lock_file
 from avatar.io.ledger import LEDGER, SOURCES, Ledger, files_digest, imported_modules, module_digest, source_digest
+from avatar.io.locks import lock_file
 
 ROOT = Path(__file__).parents[2]
 
