@@ -103,8 +103,17 @@ def dressed_outfits(config: SimulateConfig) -> list[tuple[str, OutfitConfig]]:
     for name in config.outfits or PRESETS[config.preset].outfits:
         usual = DEFAULT_SHAPES[name]
         for shape in config.shapes or [usual]:
-            asked.append((name if shape == usual else f"{name}_{Path(shape).stem}", outfit(name, shape, config.edge)))
+            folder = name if shape == usual else f"{name}_{Path(shape).stem}"
+            folder += "_motion" if is_continuous(config) else ""
+            asked.append((folder, outfit(name, shape, config.edge)))
     return asked
+
+
+def is_continuous(config: SimulateConfig) -> bool:
+    """Whether sequences are played, not poses settled."""
+    preset = PRESETS[config.preset]
+    sources = config.train_motions or config.test_motions or preset.train_motions or preset.test_motions
+    return bool(sources) and not config.settled and not config.history
 
 
 def load_motion(source: str, fps: float, seconds: float, seed: int = 0) -> Motion:
@@ -161,8 +170,7 @@ def simulate(config: SimulateConfig) -> list[FrameReport]:
         split: getattr(config, f"{split}_motions") or list(getattr(preset, f"{split}_motions"))
         for split in ("train", "test")
     }
-    continuous = any(sources.values()) and not config.settled
-    if continuous:
+    if is_continuous(config):
         work = {k: [load_motion(s, config.fps, config.seconds, config.seed) for s in v] for k, v in sources.items()}
     elif not config.history:
         work = settled_poses(config)
@@ -174,7 +182,7 @@ def simulate(config: SimulateConfig) -> list[FrameReport]:
             log.info("%s: %s", folder, history_error(dressed, measured))
             log.info("%s: %s", folder, pose_sensitivity(dressed, measured[:-1], seed=config.seed))
         else:
-            place = config.root / f"{folder}{'_motion' if continuous else ''}"
+            place = config.root / folder
             reports += simulate_outfit(clothes, place, work, workers, config.travel, config.gates, config.progress)
     for report in reports:
         if report.failed:
