@@ -175,11 +175,12 @@ def test_frames_held_back_are_a_split_that_is_predicted_scored_and_compared(job,
     assert folder.parent.name == "validation" and {path.stem for path in folder.glob("*.ply")} == set(held)
     before = (config.folder / "scores.csv").read_bytes()
     scores = evaluate(EvaluateConfig(runs=(config.folder,), split="validation", score=config.score, floors=False))
-    assert {row.frame for row in scores.frames} == set(held) and {row.variant for row in scores.rows} == {"validation"}
+    assert {row.frame for row in scores.frames} == set(held) and {row.split for row in scores.rows} == {"validation"}
     assert (config.folder / "scores.csv").read_bytes() == before
     settings = CompareConfig(table="both", runs=(config.folder,), runs_root=config.runs_root, metrics=("cd_point",))
     settings = replace(settings, splits=("test", "validation"), pictures=0, plots=False, out=tmp_path)
-    assert "| closet (validation) |" in compare(settings).read_text()
+    text = compare(settings).read_text()
+    assert "test: cd_point" in text and "validation: cd_point" in text
 
 
 def test_what_was_not_made_yet_is_named(job):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +57,11 @@ def named(method: str, *parts: str) -> str:
 def method_key(row: Score | FrameScore) -> str:
     """A method's name in tables, with its variant."""
     return named(row.method, row.variant)
+
+
+def by_split(rows: Iterable[Any]) -> list[Any]:
+    """Scores whose outfits are named with their split where it is another than test, so that tables tell them apart."""
+    return [row if row.split == "test" else replace(row, outfit=named(row.outfit, row.split)) for row in rows]
 
 
 def base_method(method: str) -> str:

@@ -72,9 +72,9 @@ def difference_table(found: Sequence[Difference], metric: str) -> Table:
     mine = [difference for difference in found if difference.metric == metric]
     methods = tuple(dict.fromkeys(difference.method for difference in mine))
     cells = {(d.outfit, d.method): d.interval for d in mine}
-    outfits = sorted(dict.fromkeys(d.outfit for d in mine), key=lambda outfit: outfit == ALL)
+    outfits = sorted(dict.fromkeys(d.outfit for d in mine), key=lambda outfit: outfit.startswith(ALL))
     rows = [
-        interval_row(outfit, [cells.get((outfit, method)) for method in methods], known.scale, outfit == ALL)
+        interval_row(outfit, [cells.get((outfit, method)) for method in methods], known.scale, outfit.startswith(ALL))
         for outfit in outfits
     ]
     confidence = 100 * mine[0].interval.confidence if mine else 95

@@ -58,7 +58,7 @@ def score_sampling_floor(
 
     if resample is None:
         log.warning("%s: no true surface to sample again, so the sampling floor compares scan halves.", outfit.name)
-    label = Label("sampling", variant="halves" if resample is None else "", commit=commit)
+    label = Label("sampling", variant="halves" if resample is None else "", commit=commit, split=split)
     return _score_floor(outfit, split, config, points, label, compare, ledger)
 
 
@@ -73,7 +73,7 @@ def score_body_floor(
             raise AvatarError("template: the body floor needs the body's faces, and this outfit has no template.")
         return Comparison(sample_body(body, points, config.seed), draw_scan(frame, config), body)
 
-    return _score_floor(outfit, split, config, points, Label("body", commit=commit), compare, ledger)
+    return _score_floor(outfit, split, config, points, Label("body", commit=commit, split=split), compare, ledger)
 
 
 def _score_floor(

@@ -21,7 +21,8 @@ class Score:
 
     ``variant`` tells settings of a method apart, ``seed``, ``steps`` and ``seconds`` are those of its training,
     ``points`` is the mean count of predicted points, ``commit`` the code that made it, ``dataset`` the outfit's,
-    ``fraction`` the share of the training frames that was trained on. Files without the last two are older.
+    ``fraction`` the share of the training frames that was trained on, ``split`` whose frames were scored. Files without
+    the last three are older.
     """
 
     table: str
@@ -39,6 +40,7 @@ class Score:
     commit: str
     dataset: str = ""
     fraction: float = 1.0
+    split: str = "test"
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class FrameScore:
     frame: str
     metric: str
     value: float
+    split: str = "test"
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,10 @@ class Scores:
 
     def __add__(self, other: Scores) -> Scores:
         return Scores(self.rows + other.rows, self.frames + other.frames)
+
+    def of_split(self, split: str) -> Scores:
+        """Those of one split alone."""
+        return Scores(*([row for row in rows if row.split == split] for rows in (self.rows, self.frames)))
 
     def of_metrics(self, names: Collection[str]) -> Scores:
         """Those of some metrics alone."""

@@ -61,6 +61,7 @@ class Label:
     seconds: float = 0.0
     commit: str = ""
     fraction: float = 1.0
+    split: str = "test"
 
 
 @dataclass(frozen=True)
@@ -271,7 +272,7 @@ def score_frames(
             values |= new
         counts.append(points)
         frames += [
-            FrameScore(outfit.name, label.method, label.variant, label.seed, name, metric, float(value))
+            FrameScore(outfit.name, label.method, label.variant, label.seed, name, metric, float(value), label.split)
             for metric, value in values.items()
         ]
     return Scores(mean_scores(frames, metrics, label, outfit.dataset, round(float(np.mean(counts)))), frames)

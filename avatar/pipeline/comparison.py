@@ -12,13 +12,13 @@ import yaml
 
 from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.layouts import find_outfit
-from avatar.data.outfits import Outfit
+from avatar.data.outfits import SPLITS, Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.environment import prepared_process
-from avatar.evaluation.aggregate import FLOORS, method_key, order_methods
+from avatar.evaluation.aggregate import FLOORS, by_split, method_key, named, order_methods
 from avatar.evaluation.canonical_scores import canonical_overview, canonical_table
 from avatar.evaluation.differences import budget_table, compare_methods, difference_table, differences_csv
-from avatar.evaluation.forms import FormConfig, ReportedTable, form_table, reported_table
+from avatar.evaluation.forms import Axis, FormConfig, ReportedTable, form_table, reported_table
 from avatar.evaluation.metrics import find_metrics
 from avatar.evaluation.plots import plot_fractions, plot_outfits, plot_progress, plot_times, save_figure
 from avatar.evaluation.scores import Score, Scores, read_scores, write_scores
@@ -55,7 +55,7 @@ class CompareConfig:
     canonicalizers: tuple[Path, ...] = ()  # folders of scored canonicalizers (tools/canonicalize.py scored=...)
     plots: bool = True
     pictures: int = 3  # unseen poses an outfit in the picture of all methods; 0 for none
-    splits: tuple[str, ...] = ("test",)  # that were scored; the first is the picture's
+    splits: tuple[str, ...] = ("test",)  # that were scored; the first is that of plots and pictures
     data_root: Path | None = None  # where the data are now; where they were at training if null
     out: Path | None = None  # where the table's files go; <runs_root>/tables if null
 
@@ -96,11 +96,12 @@ def compare_runs(config: CompareConfig, runs: tuple[Path, ...]) -> tuple[list[Ta
     scores = gather_scores(config, runs)
     write_scores(file_of(config, "csv"), scores)
     scores, shared = without_shared_variant(scores)
-    tables = [*main_tables(config, scores.rows), *side_tables(config, scores)]
+    splits = list(dict.fromkeys(row.split for row in scores.rows))
+    tables = [*main_tables(config, scores.rows, splits), *side_tables(config, scores, splits)]
     tables[0] = replace(tables[0], notes=(*tables[0].notes, *([f"All methods: {shared}."] if shared else [])))
     if config.reported is not None:
         tables.append(reported_table(config.reported))
-    pictures = [*save_plots(config, scores.rows, runs)]
+    pictures = [*save_plots(config, scores.of_split(splits[0]).rows, runs)]
     if config.pictures:
         grid = file_of(config, "poses.jpg")
         pictures += [grid] if draw_pose_grid(grid, runs, config.pictures, config.splits[0], config.data_root) else []
@@ -145,7 +146,8 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
             )
     floors = Scores()
     for outfit, (dataset,) in sorted(datasets.items()):
-        floors = floors + read_floors(config.runs_root, dataset, outfit, scores.rows)
+        for split in set(config.splits) & set(SPLITS):
+            floors = floors + read_floors(config.runs_root, dataset, outfit, scores.rows, split)
     whole = floors + scores
     return Scores([replace(row, table=config.table) for row in whole.rows], whole.frames)
 
@@ -169,15 +171,26 @@ def dataset_of(run: Path) -> str:
     return str(yaml.safe_load(path.read_text())["dataset"])
 
 
-def main_tables(config: CompareConfig, rows: list[Score]) -> list[Table]:
-    """The table in the form asked for, or outfits by methods for each metric with the excess over the floors."""
+def main_tables(config: CompareConfig, rows: list[Score], splits: list[str]) -> list[Table]:
+    """The table in the form asked for, or outfits by methods for each metric with the excess over the floors.
+
+    A form has all splits as outfits of their own and then no summary over outfits; else each split has its tables.
+    """
+    if config.form is None and len(splits) > 1:
+        tables = []
+        for split in splits:
+            mine = main_tables(config, [row for row in rows if row.split == split], [split])
+            tables += [replace(table, title=f"{split}: {table.title}") for table in mine]
+        return tables
     metrics = [name for name in config.metrics if name in {row.metric for row in rows}]
     if config.form is not None:
-        tables = [form_table(rows, metrics, config.form, config.table)]
+        form = config.form if len(splits) == 1 else split_form(config.form)
+        rows = by_split(rows)
+        tables = [form_table(rows, metrics, form, config.table)]
         distances = [name for name in metrics if name.startswith("cd_")]
-        if distances and len(config.splits) == 1 and any(row.method == "sampling" for row in rows):
+        if distances and any(row.method == "sampling" for row in rows):
             title = f"{config.table}, excess over the sampling floor"
-            tables.append(form_table(rows, distances, config.form, title, excess=True))
+            tables.append(form_table(rows, distances, form, title, excess=True))
         return tables
     tables = [outfit_table(rows, metric) for metric in metrics]
     methods = {row.method for row in rows}
@@ -187,14 +200,25 @@ def main_tables(config: CompareConfig, rows: list[Score]) -> list[Table]:
     return tables
 
 
-def side_tables(config: CompareConfig, scores: Scores) -> list[Table]:
-    """What training cost, and differences to the baseline, which are written as CSV too."""
+def split_form(form: FormConfig) -> FormConfig:
+    """A form for several splits: outfits stand in it, and no mean or worst of all rows."""
+    rows = form.rows if Axis.outfit in (*form.rows, *form.columns) else (Axis.outfit, *form.rows)
+    return replace(form, rows=rows, outfits=True, summary=False)
+
+
+def side_tables(config: CompareConfig, scores: Scores, splits: list[str]) -> list[Table]:
+    """What training cost, and differences to the baseline on each split, which are written as CSV too."""
     tables = [budget_table(scores.rows)]
     if config.baseline:
         scored = {row.metric for row in scores.frames if row.method not in FLOORS[:2]}  # floors may have more
         metrics = [name for name in config.metrics if name in scored]
         how = (config.baseline, config.resamples, config.confidence)
-        found = [difference for metric in metrics for difference in compare_methods(scores, metric, *how)]
+        found = [
+            replace(difference, outfit=named(difference.outfit, *({split} - {"test"})))
+            for metric in metrics
+            for split in splits
+            for difference in compare_methods(scores.of_split(split), metric, *how)
+        ]
         write_whole(file_of(config, "differences.csv"), differences_csv(found).encode())
         tables += [difference_table(found, metric) for metric in metrics]
     return tables

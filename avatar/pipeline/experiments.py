@@ -129,7 +129,7 @@ def score_run(config: ExperimentConfig, folder: Path) -> None:
     for split in config.compare.splits:
         where = {"split": split, "data_root": config.data_root}
         predict(PredictConfig(run=folder, **made, **where))
-        evaluate(EvaluateConfig(runs=(folder,), score=config.score, floors=split == "test", **where))
+        evaluate(EvaluateConfig(runs=(folder,), score=config.score, floors=split != VALIDATION, **where))
 
 
 def tabulate_experiment(configs: Sequence[ExperimentConfig]) -> Path:

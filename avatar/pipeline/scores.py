@@ -13,7 +13,7 @@ from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.environment import prepared_process
-from avatar.evaluation.aggregate import FLOORS, method_key
+from avatar.evaluation.aggregate import FLOORS, by_split, method_key
 from avatar.evaluation.floors import score_body_floor, score_sampling_floor
 from avatar.evaluation.scores import Score, Scores, frames_path, read_scores, write_scores
 from avatar.evaluation.scoring import SOURCE, Label, ScoreConfig, find_predictions, remember_scores, score_predictions
@@ -141,7 +141,9 @@ def score_foreign(config: EvaluateConfig, folder: Path) -> Scores:
     out = config.out or folder
     with lock_folder(out, wait=True):
         ledger = Ledger(out)
-        scores = score_predictions(folder, outfit, config.split, config.score, Label(config.label), None, ledger)
+        scores = score_predictions(
+            folder, outfit, config.split, config.score, Label(config.label, split=config.split), None, ledger
+        )
         save_scores(out / "scores.csv", scores, ledger, keyed(SOURCE))
         floors = score_floors(outfit, config, scores.rows[0].points, out / "floors.csv") if config.floors else Scores()
     return floors + scores
@@ -161,12 +163,13 @@ def score_runs(config: EvaluateConfig) -> Scores:
         settings = avatar.config
         label = Label(
             settings.method.variant,
-            variant=", ".join(part for part in (variant_of(settings), config.split) if part not in ("", "test")),
+            variant=variant_of(settings),
             seed=settings.train.seed,
             steps=avatar.steps,
             seconds=avatar.seconds,
             commit=current_commit(),
             fraction=settings.split.train_fraction,
+            split=config.split,
         )
         mine, outfits = Scores(), run_outfits(avatar, config.data_root)
         with lock_folder(run / "predictions", wait=True):
@@ -230,9 +233,9 @@ def floors_folder(root: Path, dataset: str, outfit: str, points: int) -> Path:
     return root / "floors" / dataset / outfit / str(points)
 
 
-def read_floors(root: Path, dataset: str, outfit: str, rows: Iterable[Score]) -> Scores:
-    """An outfit's floors at the point count that most of its methods in ``rows`` predict; none where none were made."""
-    path = floors_folder(root, dataset, outfit, common_points(rows, outfit)) / "scores.csv"
+def read_floors(root: Path, dataset: str, outfit: str, rows: Iterable[Score], split: str = "test") -> Scores:
+    """A split's floors at the point count that most of an outfit's methods in ``rows`` predict, if they were made."""
+    path = scores_file(floors_folder(root, dataset, outfit, common_points(rows, outfit)), split)
     return read_scores(path) if path.is_file() else Scores()
 
 
@@ -257,10 +260,11 @@ def are_current(path: Path) -> bool:
 
 def print_tables(scores: Scores) -> None:
     """Prints every metric of every outfit, and the excess over the sampling floor where floors were scored."""
-    for outfit in dict.fromkeys(row.outfit for row in scores.rows):
-        print(to_markdown(metric_table(scores.rows, outfit)))
-    if "sampling" in {row.method for row in scores.rows}:
-        print(to_markdown(outfit_table(scores.rows, "cd_point", View.EXCESS)))
+    rows = by_split(scores.rows)
+    for outfit in dict.fromkeys(row.outfit for row in rows):
+        print(to_markdown(metric_table(rows, outfit)))
+    if "sampling" in {row.method for row in rows}:
+        print(to_markdown(outfit_table(rows, "cd_point", View.EXCESS)))
 
 
 def read_all_scores(paths: Iterable[Path]) -> Scores:

@@ -5,7 +5,7 @@ import pytest
 from avatar.checks import DataError
 from avatar.evaluation.scores import FrameScore, Score, Scores, frames_path, read_scores, write_scores
 
-COLUMNS = "table,outfit,method,variant,metric,value,unit,frames,seed,steps,seconds,points,commit,dataset,fraction"
+COLUMNS = "table,outfit,method,variant,metric,value,unit,frames,seed,steps,seconds,points,commit,dataset,fraction,split"
 
 
 def some_scores():
@@ -65,7 +65,7 @@ def test_unreadable_files_are_named(tmp_path):
 
 
 def test_files_from_before_data_sets_and_fractions_were_kept_are_read(tmp_path):
-    older = COLUMNS.removesuffix(",dataset,fraction")
+    older = COLUMNS.removesuffix(",dataset,fraction,split")
     (tmp_path / "main.csv").write_text(older + "\nmain,dress,closet,,cd_point,0.5,m^2,20,1,1,1,1,ab\n")
     (row,) = read_scores(tmp_path / "main.csv").rows
     assert (row.value, row.dataset, row.fraction) == (0.5, "", 1.0)
