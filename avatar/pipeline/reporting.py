@@ -12,10 +12,11 @@ from avatar.environment import prepared_process
 from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent, write_report
 from avatar.evaluation.scores import Scores
 from avatar.evaluation.tables import View, metric_table, outfit_table
-from avatar.export.drawing import Camera, frame_camera
 from avatar.export.pictures import (
+    Camera,
     color_bar,
     contact_sheet,
+    frame_camera,
     render_error,
     render_mesh,
     render_points,
