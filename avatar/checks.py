@@ -162,7 +162,7 @@ def check_faces(faces: np.ndarray, count: int) -> None:
     if not len(faces) or not np.issubdtype(faces.dtype, np.integer):
         raise AvatarError(f"faces: expected triangles of whole numbers, got {len(faces)} of {faces.dtype}.")
     if faces.min() < 0 or faces.max() >= count:
-        raise AvatarError(f"faces: expected indices in [0, {count}), got {faces.min()} to {faces.max()}.")
+        raise AvatarError(f"faces: expected vertex indices in [0, {count}), got {faces.min()} to {faces.max()}.")
 
 
 def check_suffix(path: Path, endings: Iterable[str], what: str) -> str:
@@ -172,7 +172,7 @@ def check_suffix(path: Path, endings: Iterable[str], what: str) -> str:
         DataError: for one that is none of ``endings``.
     """
     if path.suffix.lower() not in endings:
-        raise DataError(path, f"expected {what} ending in {', '.join(endings)}, got {path.suffix!r}.")
+        raise DataError(path, f"expected {what} ending in {' or '.join(endings)}, got {path.suffix!r}.")
     return path.suffix.lower()
 
 
@@ -180,12 +180,12 @@ def check_file(path: Path, limit: int) -> None:
     """Refuses a file before it is read.
 
     Raises:
-        DataError: for one that is missing or larger than ``limit`` bytes.
+        DataError: for one that is missing, empty or larger than ``limit`` bytes.
     """
     if not path.is_file():
         raise DataError(path, "there is no such file.")
-    if path.stat().st_size > limit:
-        raise DataError(path, f"expected at most {limit} bytes, got {path.stat().st_size}.")
+    if not 0 < (size := path.stat().st_size) <= limit:
+        raise DataError(path, f"expected at most {limit} and at least 1 bytes, got {size}.")
 
 
 def require(package: str) -> ModuleType:

@@ -56,9 +56,6 @@ class Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
         """Ends the bar, or says how far it came."""
         if self.bar is not None:
             self.bar.close()
@@ -105,14 +102,8 @@ class Progress:
         self.told, self.told_at = time.monotonic(), self.done
         left = self.seconds_left() if self.done < self.total else 0.0
         ahead = f", {in_words(left)} left" if 0 < left < math.inf else ""
-        report.info(
-            "%s: %s %d of %d%s, %s%s", self.what, self.unit, self.done, self.total, self.values, self.clock, ahead
-        )
-
-    @property
-    def clock(self) -> str:
-        """The time since it began, in words."""
-        return in_words(self.spent + self.seconds)
+        clock = in_words(self.spent + self.seconds)
+        report.info("%s: %s %d of %d%s, %s%s", self.what, self.unit, self.done, self.total, self.values, clock, ahead)
 
 
 def tracked(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from avatar.checks import AvatarError, check_oriented, check_shape, check_suffix, require
-from avatar.export.drawing import disc_radii
+from avatar.export.pictures import disc_radii
 from avatar.io.meshes import check_mesh
 from avatar.io.npz import write_whole
 from avatar.records import Mesh, PointCloud
@@ -38,22 +39,16 @@ def write_usd_points(
         DataError: for another file name ending.
     """
     usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
-
-    def define(stage: Any) -> Callable[[PointCloud, int], None]:
+    with _usd_stage(path, fps) as stage:
         prim = usd_geom.Points.Define(stage, "/avatar/points")
         prim.SetNormalsInterpolation(usd_geom.Tokens.vertex)
-
-        def sample(cloud: PointCloud, frame: int) -> None:
+        for cloud, frame in _samples(stage, clouds, frames):
             check_oriented(cloud.points, cloud.normals)
             widths = 2 * disc_radii(np.asarray(cloud.points, np.float64))
             prim.GetPointsAttr().Set(_vectors(vt, cloud.points), frame)
             prim.GetNormalsAttr().Set(_vectors(vt, cloud.normals), frame)
             prim.GetWidthsAttr().Set(vt.FloatArray.FromNumpy(widths.astype(np.float32)), frame)
             prim.GetExtentAttr().Set(_extent(vt, cloud.points, widths.max() / 2), frame)
-
-        return sample
-
-    _write_usd(path, clouds, fps, frames, define)
 
 
 def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float, frames: Sequence[int] | None = None) -> None:
@@ -71,14 +66,12 @@ def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float, frame
         DataError: for another file name ending.
     """
     usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
-
-    def define(stage: Any) -> Callable[[Mesh, int], None]:
+    with _usd_stage(path, fps) as stage:
         prim = usd_geom.Mesh.Define(stage, "/avatar/mesh")
         prim.CreateSubdivisionSchemeAttr(usd_geom.Tokens.none)
         prim.CreateOrientationAttr(usd_geom.Tokens.rightHanded)
         prim.CreateDoubleSidedAttr(True)
-
-        def sample(mesh: Mesh, frame: int) -> None:
+        for mesh, frame in _samples(stage, meshes, frames):
             check_mesh(mesh)
             prim.GetPointsAttr().Set(_vectors(vt, mesh.vertices), frame)
             counts = np.full(len(mesh.faces), 3, np.int32)
@@ -90,13 +83,10 @@ def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float, frame
                 primvar = prim.CreateDisplayColorPrimvar(usd_geom.Tokens.vertex)
                 primvar.Set(_vectors(vt, mesh.colors), frame)
 
-        return sample
 
-    _write_usd(path, meshes, fps, frames, define)
-
-
-def _write_usd(path: str | Path, items: Iterable, fps: float, frames: Sequence[int] | None, define: Callable) -> None:
-    """The stage around the samples: units, axes, time; whole or not at all."""
+@contextmanager
+def _usd_stage(path: str | Path, fps: float) -> Iterator[Any]:
+    """A USD stage in metres, y up; at the end of the ``with`` block its file is there whole, or not at all."""
     path = Path(path)
     suffix = check_suffix(path, USD_FORMATS, "a USD file")
     _check_fps(fps)
@@ -110,18 +100,22 @@ def _write_usd(path: str | Path, items: Iterable, fps: float, frames: Sequence[i
         stage.SetTimeCodesPerSecond(fps)
         stage.SetFramesPerSecond(fps)
         stage.SetDefaultPrim(usd_geom.Xform.Define(stage, "/avatar").GetPrim())
-        sample = define(stage)
-        last = held = None
-        for number, item in _numbered(items, frames):
-            if last is None:
-                stage.SetStartTimeCode(number)
-            elif number > last + 1:
-                sample(held, number - 1)  # programs blend neighbouring samples, which over a gap would be wrong
-            sample(item, number)
-            last, held = number, item
-        stage.SetEndTimeCode(last)
+        yield stage
         stage.GetRootLayer().Save()
         partial.replace(path)
+
+
+def _samples(stage: Any, items: Iterable, frames: Sequence[int] | None) -> Iterator[tuple[Any, int]]:
+    """Items with their time codes; at the end of a gap the one before it again, as programs blend neighbours."""
+    last = held = None
+    for number, item in _numbered(items, frames):
+        if last is None:
+            stage.SetStartTimeCode(number)
+        elif number > last + 1:
+            yield held, number - 1
+        yield item, number
+        last, held = number, item
+    stage.SetEndTimeCode(last)
 
 
 def _numbered(items: Iterable, frames: Sequence[int] | None) -> Iterator[tuple[int, Any]]:

@@ -19,8 +19,14 @@ from avatar.evaluation.canonical_truth import Canonicalized, check_truth
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.evaluation.scoring import Label
 from avatar.evaluation.tables import to_markdown
-from avatar.export.drawing import frame_camera, load_pyvista
-from avatar.export.pictures import contact_sheet, render_mesh, render_points, save_picture
+from avatar.export.pictures import (
+    contact_sheet,
+    frame_camera,
+    load_pyvista,
+    render_mesh,
+    render_points,
+    save_picture,
+)
 from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, module_digest
 from avatar.io.locks import lock_folder

@@ -13,8 +13,8 @@ from pathlib import Path
 from avatar.checks import AvatarError
 from avatar.environment import prepared_process
 from avatar.evaluation.scoring import ScoreConfig
-from avatar.export.drawing import load_pyvista
 from avatar.export.meshing import require_poisson
+from avatar.export.pictures import load_pyvista
 from avatar.io.npz import write_whole
 from avatar.methods.canonicalizer import CanonicalizeConfig
 from avatar.methods.points import check_count

@@ -12,7 +12,7 @@ from avatar.data.outfits import SPLITS, VALIDATION
 from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.scoring import ScoreConfig
-from avatar.export.drawing import load_pyvista
+from avatar.export.pictures import load_pyvista
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.locks import lock_folder
 from avatar.methods.base import CANONICALIZER

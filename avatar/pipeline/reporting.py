@@ -12,8 +12,16 @@ from avatar.environment import prepared_process
 from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent, write_report
 from avatar.evaluation.scores import Scores
 from avatar.evaluation.tables import View, metric_table, outfit_table
-from avatar.export.drawing import Camera, frame_camera
-from avatar.export.pictures import color_bar, contact_sheet, render_error, render_mesh, render_points, save_picture
+from avatar.export.pictures import (
+    Camera,
+    color_bar,
+    contact_sheet,
+    frame_camera,
+    render_error,
+    render_mesh,
+    render_points,
+    save_picture,
+)
 from avatar.geometry.trees import build_tree
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points

@@ -5,11 +5,13 @@ import pytest
 import trimesh
 
 from avatar.checks import AvatarError, DataError
-from avatar.export import drawing
-from avatar.export.drawing import BACKGROUND, Camera, frame_camera
+from avatar.export import pictures
 from avatar.export.pictures import (
+    BACKGROUND,
+    Camera,
     color_bar,
     contact_sheet,
+    frame_camera,
     map_colors,
     render_error,
     render_mesh,
@@ -168,6 +170,6 @@ def test_wrong_arguments_are_named():
 
 
 def test_a_machine_without_gl_is_told_what_to_install(monkeypatch):
-    monkeypatch.setattr(drawing, "GL_LIBRARIES", ("libnothing.so.1",))
+    monkeypatch.setattr(pictures, "GL_LIBRARIES", ("libnothing.so.1",))
     with pytest.raises(AvatarError, match="apt-get install"):
         render_points(box_cloud())

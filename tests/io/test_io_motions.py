@@ -228,7 +228,7 @@ def test_bad_requests_are_refused(tmp_path, walk):
     write_motion(tmp_path / "walk.npz", walk)
     for call, message in (
         (lambda: read_motion(tmp_path / "none.npz"), "there is none"),
-        (lambda: read_motion(tmp_path / "none.bvh"), "there is none"),
+        (lambda: read_motion(tmp_path / "none.bvh"), "there is no such file"),
         (lambda: read_motion(tmp_path / "walk.fbx"), "ending in .npz or .bvh"),
         (lambda: read_motion(tmp_path / "walk.npz", up="x"), "up: expected y, z"),
         (lambda: read_motion(tmp_path / "walk.npz", fps=0), "fps: expected 1 to 1000"),
