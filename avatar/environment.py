@@ -172,7 +172,7 @@ def warn_once_of_early_torch() -> None:
 
 
 def keep_freed_memory() -> bool:
-    """Has the C library keep what is freed for what is asked for next; says whether it could be told so.
+    """Has the C library keep what is freed for what is asked for next; says whether it could be set so.
 
     By default it gives arrays above 32 MiB back to the system at once, and every new one costs a page fault for each
     4 KiB: a third of a full-size decoder's time on the CPU. The price is memory, for pieces do not always fit: a

@@ -47,8 +47,8 @@ class Progress:
         """
         self.what, self.total, self.unit, self.done, self.before = what, total, unit, done, done
         self.budget, self.spent, self.silent = budget, spent, silent
-        self.started = self.told = time.monotonic()
-        self.values, self.told_at = "", -1
+        self.started = self.logged = time.monotonic()
+        self.values, self.logged_count = "", -1
         watched = not silent and sys.stderr.isatty()
         self.bar = tqdm(total=total, initial=done, desc=what, unit=unit) if watched else None
 
@@ -84,7 +84,7 @@ class Progress:
             if self.budget is not None and math.isfinite(left):  # the end that the bar's own estimate leads to
                 self.bar.total = min(self.total, self.done + max(1, round(left * pace)))
             self.bar.update()
-        elif time.monotonic() - self.told > LINE_S:
+        elif time.monotonic() - self.logged > LINE_S:
             self.say()
 
     def show(self, **values: str) -> None:
@@ -97,9 +97,9 @@ class Progress:
 
     def say(self) -> None:
         """A line, unless it would say the same again."""
-        if self.silent or self.told_at == self.done:
+        if self.silent or self.logged_count == self.done:
             return
-        self.told, self.told_at = time.monotonic(), self.done
+        self.logged, self.logged_count = time.monotonic(), self.done
         left = self.seconds_left() if self.done < self.total else 0.0
         ahead = f", {in_words(left)} left" if 0 < left < math.inf else ""
         clock = in_words(self.spent + self.seconds)

@@ -63,7 +63,7 @@ FILLED = {
 
 # Less work for a verb, nothing else; they replace the values that are printed.
 CANONICALIZER = (
-    *("train.first_steps=200", "train.second_steps=2", "train.code_steps=1", "train.batch=1"),  # enough for sound scans
+    *("train.first_steps=200", "train.second_steps=2", "train.code_steps=1", "train.batch=1"),  # enough for valid scans
     *("train.draw.scan=256", "train.draw.body=256", "train.draw.edges=64", "train.draw.pool=3000"),
     *("pictures=1", "scan.edge=0.04"),
 )

@@ -287,6 +287,6 @@ def canonical_overview(rows: Sequence[Score], metrics: Sequence[str] = OVERVIEW)
 
 
 TRUE_NOTE = (
-    f"{TRUE}: every point carried by the weights of the body under its true place. What is left is the cloth's own "
+    f"{TRUE}: every point posed with the weights of the body under its true place. What is left is the cloth's own "
     "motion over the body. Means are over the points a method kept (see points_lost)."
 )

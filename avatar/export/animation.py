@@ -62,7 +62,7 @@ def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float, frame
         fps, frames: as `write_usd_points`.
 
     Raises:
-        AvatarError: for no frames, meshes that are not sound, numbers, fps, or when usd-core is missing.
+        AvatarError: for no frames, meshes that are not valid, numbers, fps, or when usd-core is missing.
         DataError: for another file name ending.
     """
     usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")

@@ -105,7 +105,7 @@ class PoissonMesher:
         try:
             check_mesh(raw)
         except AvatarError as error:
-            raise MeshingError(f"Poisson reconstruction gave no sound surface: {error}") from error
+            raise MeshingError(f"Poisson reconstruction gave no valid surface: {error}") from error
         mesh = trim_surface(raw, PointCloud(points, normals), self.config.max_hole, self.config.min_part)
         if not len(mesh.faces):
             raise MeshingError(
@@ -127,7 +127,7 @@ class PoissonMesher:
         """One job for the worker; whatever goes wrong, the next job finds a fresh one."""
         if self._process is None or not self._process.is_alive():
             self._start()
-        config, sound = self.config, False
+        config, valid = self.config, False
         watchdog = threading.Timer(config.timeout_s + GRACE_S, self._process.kill)  # a worker that does not even listen
         watchdog.start()
         try:
@@ -140,7 +140,7 @@ class PoissonMesher:
                 raise MeshingError(f"open3d: {self._connection.recv_bytes().decode()}")
             vertices = np.frombuffer(self._connection.recv_bytes(), np.float64).reshape(-1, 3)
             faces = np.frombuffer(self._connection.recv_bytes(), np.int32).reshape(-1, 3)
-            sound = verdict == SOLVED
+            valid = verdict == SOLVED
         except (EOFError, OSError) as error:
             self._process.join(timeout=5)
             code = self._process.exitcode
@@ -150,7 +150,7 @@ class PoissonMesher:
             ) from error
         finally:
             watchdog.cancel()
-            if not sound:
+            if not valid:
                 self.close()
         return Mesh(vertices, faces)
 

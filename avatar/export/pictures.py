@@ -229,7 +229,7 @@ def render_mesh(mesh: Mesh, camera: Camera | None = None, colors: str | tuple | 
         ``(H, W, 3)`` uint8.
 
     Raises:
-        AvatarError: for a mesh that is not sound, or when pictures cannot be made on this machine.
+        AvatarError: for a mesh that is not valid, or when pictures cannot be made on this machine.
     """
     check_mesh(mesh)
     camera = camera or frame_camera(mesh.vertices)

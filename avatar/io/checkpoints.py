@@ -126,7 +126,7 @@ def _is_listing(entries: dict[str, Any]) -> bool:
     """Whether a manifest lists checkpoints of its own folder: a seal can be forged, a name could lead elsewhere."""
     last = entries.get("last", [])
     listed = [*last, *([entries["best"]] if "best" in entries else [])] if isinstance(last, list) else [None]
-    sound = all(
+    valid = all(
         isinstance(entry, dict)
         and NAME.fullmatch(str(entry.get("file")))
         and type(entry.get("step")) is int
@@ -134,7 +134,7 @@ def _is_listing(entries: dict[str, Any]) -> bool:
         and re.fullmatch("[0-9a-f]{16,64}", str(entry.get("sha256")))
         for entry in listed
     )
-    return sound and all(entry["score"] is not None for entry in listed[len(last) :])
+    return valid and all(entry["score"] is not None for entry in listed[len(last) :])
 
 
 def _read_valid(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
@@ -150,8 +150,8 @@ def _read_valid(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception:  # the hash of a hostile file can be right: what it makes torch raise may be anything
         return None
-    sound = isinstance(state, dict) and "score" in state and all(_is_finite(value) for _, value in named_tensors(state))
-    return state if sound else None
+    valid = isinstance(state, dict) and "score" in state and all(_is_finite(value) for _, value in named_tensors(state))
+    return state if valid else None
 
 
 @contextmanager
@@ -203,12 +203,12 @@ def building(path: Path, weights: Mapping[str, Tensor]) -> Iterator[None]:
 
 
 def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
-    """The resume state of the newest sound checkpoint (``last``) or of the best (``best``); None without any.
+    """The resume state of the newest valid checkpoint (``last``) or of the best (``best``); None without any.
 
     A checkpoint whose bytes do not match its hash is passed over with a warning that names both files.
 
     Raises:
-        DataError: when checkpoints are listed and none of them is sound.
+        DataError: when checkpoints are listed and none of them is valid.
     """
     entries = read_manifest(folder)
     listed = [entries["best"]] if which == "best" and "best" in entries else []
@@ -222,7 +222,7 @@ def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
         damaged = folder / entry["file"]
         warnings.warn(f"{damaged}: damaged or missing checkpoint; falling back to {following}.", stacklevel=2)
     if listed or (which == "last" and any(folder.glob("step-*.pt"))):
-        raise DataError(folder, "no checkpoint listed here is sound.", "Restore one of them or delete the run.")
+        raise DataError(folder, "no checkpoint listed here is valid.", "Restore one of them or delete the run.")
     return None
 
 

@@ -154,7 +154,7 @@ def write_open_garment(path: Path, garment: OpenGarment) -> None:
 
 
 def read_open_garment(path: Path) -> OpenGarment:
-    """Reads an outfit's garment; faces come as int64. Raises `DataError` when the file is not sound."""
+    """Reads an outfit's garment; faces come as int64. Raises `DataError` when the file is not valid."""
     keys = {"faces": "int F 3", "canonical": "float V 3", "labels": "uint8 V", "names": "text G"}
     stored = read_arrays(path, keys, limit=FRAME_BYTES, version=GARMENT_FORMAT)
     names = tuple(str(name) for name in stored["names"])

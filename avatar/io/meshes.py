@@ -39,7 +39,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> None:
     meshes give equal bytes, and the file appears whole or not at all.
 
     Raises:
-        AvatarError: for a mesh that is not sound.
+        AvatarError: for a mesh that is not valid.
         DataError: for another file name ending.
     """
     path = Path(path)
@@ -91,7 +91,7 @@ def read_mesh(path: str | Path) -> Mesh:
             mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int64), colors)
         check_mesh(mesh)
     except AvatarError as error:
-        raise DataError(path, f"holds no sound mesh: {error}") from error
+        raise DataError(path, f"holds no valid mesh: {error}") from error
     return mesh
 
 
@@ -123,7 +123,7 @@ def _largest_count(suffix: str, data: bytes) -> int:
     elif suffix == ".off":
         counts = re.findall(rb"\d+", re.sub(rb"#[^\n]*", b"", data[:4096]))[:3]
     elif suffix == ".glb" and len(data) >= 20:
-        with suppress(ValueError, KeyError, TypeError):  # not sound, which the parser reports
+        with suppress(ValueError, KeyError, TypeError):  # not valid, which the parser reports
             length = struct.unpack_from("<I", data, 12)[0]
             counts = [int(accessor["count"]) for accessor in json.loads(data[20 : 20 + length])["accessors"]]
     return max((int(count) for count in counts), default=0)

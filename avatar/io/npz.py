@@ -67,7 +67,7 @@ def read_arrays(
             return {key: _read(path, archive, members[key], key, wanted[key], dims) for key in wanted}
     except DAMAGED as error:
         hint = "Make or download it again."
-        raise DataError(path, f"expected a sound npz file, reading failed: {error}.", hint) from error
+        raise DataError(path, f"expected a valid npz file, reading failed: {error}.", hint) from error
 
 
 def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipfile.ZipInfo]:
@@ -121,7 +121,7 @@ def _read_header(path: Path, key: str, stream: IO[bytes]) -> tuple[tuple[int, ..
     try:
         return READERS[np.lib.format.read_magic(stream)](stream)
     except DAMAGED:
-        raise  # told by `read_arrays`
+        raise  # `read_arrays` reports it
     except Exception as error:
         raise DataError(path, f"{key}: expected a plain array, its header is not one ({error}).") from error
 

@@ -1,4 +1,4 @@
-"""Motions of foreign skeletons carried over to the 22 body joints in SMPL order."""
+"""Motions of foreign skeletons moved to the 22 body joints in SMPL order."""
 
 from __future__ import annotations
 
@@ -214,8 +214,8 @@ def _calibrated_turns(bvh: BvhMotion, source: dict[int, int], rest: np.ndarray) 
         children = [child for child in source if _mapped_parent(child, source) == joint]
         if children:
             bones = positions[:, [source[child] for child in children]] - positions[:, index : index + 1]
-            carried = np.einsum("tij,bj->tbi", above, rest[children] - rest[joint])
-            pointing[joint] = np.stack([_align(c, b) for c, b in zip(carried, bones)]) @ above
+            posed = np.einsum("tij,bj->tbi", above, rest[children] - rest[joint])
+            pointing[joint] = np.stack([_align(c, b) for c, b in zip(posed, bones)]) @ above
         between = np.swapaxes(rotations[:, index], 1, 2) @ pointing[joint]
         turns[joint] = bvh.rotations[:, index] @ Rotation.from_matrix(between).mean().as_matrix()
     return turns

@@ -1,4 +1,4 @@
-"""Refusals: every mistake users make with their own scans is named, with what would hint it; sound data passes."""
+"""Refusals: every mistake users make with their own scans is named, with what would hint it; valid data passes."""
 
 import dataclasses
 import time

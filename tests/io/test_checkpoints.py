@@ -81,7 +81,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(tmp_path, damage):
     assert load_checkpoint(tmp_path)["step"] == 2
     for path in tmp_path.glob("*.pt"):
         path.write_bytes(b"")
-    with pytest.raises(DataError, match="no checkpoint listed here is sound"), pytest.warns(UserWarning):
+    with pytest.raises(DataError, match="no checkpoint listed here is valid"), pytest.warns(UserWarning):
         load_checkpoint(tmp_path)
 
 
@@ -98,16 +98,16 @@ def test_every_flipped_bit_and_truncation_is_noticed(tmp_path):
     newest = save_checkpoint(tmp_path, state(2), 2, 0.2)
     rng = random.Random(0)
     for path, expected in ((newest, (1,)), (tmp_path / MANIFEST, (1, 2))):
-        sound = path.read_bytes()
+        valid = path.read_bytes()
         for trial in range(60):
-            data = bytearray(sound)
+            data = bytearray(valid)
             data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-            path.write_bytes(bytes(data) if trial < 40 else sound[: rng.randrange(len(sound))])
+            path.write_bytes(bytes(data) if trial < 40 else valid[: rng.randrange(len(valid))])
             with pytest.warns(UserWarning, match="damaged"):
                 loaded = load_checkpoint(tmp_path)
             assert loaded["step"] in expected
             assert torch.equal(loaded["model"]["weight"], torch.full((64,), float(loaded["step"])))
-        path.write_bytes(sound)
+        path.write_bytes(valid)
 
 
 def test_a_lost_manifest_is_made_again(tmp_path):

@@ -149,7 +149,7 @@ def test_damage_anywhere_is_one_error_or_the_same_numbers(tmp_path, arrays):
 @pytest.mark.parametrize("data", [b"", b"not a zip", b"PK\x03\x04"])
 def test_what_is_no_npz_is_one_error(tmp_path, data):
     (tmp_path / "a.npz").write_bytes(data)
-    with pytest.raises(DataError, match="expected a sound npz file"):
+    with pytest.raises(DataError, match="expected a valid npz file"):
         read_arrays(tmp_path / "a.npz", KEYS)
     with pytest.raises(DataError, match="there is none"):
         read_arrays(tmp_path / "none.npz", KEYS)

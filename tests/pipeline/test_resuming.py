@@ -69,9 +69,9 @@ def test_predict_mesh_and_evaluate_do_what_is_missing_or_damaged_and_nothing_els
     calls = count(point_methods, "predict")
     predict(PredictConfig(run=run, **points))
     assert calls == []
-    sound = spoil(clouds[1])
+    valid = spoil(clouds[1])
     predict(PredictConfig(run=run, **points))
-    assert len(calls) == 1 and clouds[1].read_bytes() == sound
+    assert len(calls) == 1 and clouds[1].read_bytes() == valid
     predict(PredictConfig(run=run, points=1600, device="cpu"))
     assert len(calls) == 1 + frames
     predict(PredictConfig(run=run, **points))
@@ -82,9 +82,9 @@ def test_predict_mesh_and_evaluate_do_what_is_missing_or_damaged_and_nothing_els
     calls = count(meshing.PoissonMesher, "mesh")
     mesh(MeshConfig(**settings))
     assert calls == []
-    sound = spoil(sorted(target.glob("*.ply"))[0])
+    valid = spoil(sorted(target.glob("*.ply"))[0])
     mesh(MeshConfig(**settings))
-    assert len(calls) == 1 and sorted(target.glob("*.ply"))[0].read_bytes() == sound
+    assert len(calls) == 1 and sorted(target.glob("*.ply"))[0].read_bytes() == valid
 
     config = EvaluateConfig(runs=(run,), score=ScoreConfig(scan_points=500, metrics=METRICS))
     first = evaluate(config)

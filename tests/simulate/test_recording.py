@@ -203,7 +203,7 @@ def test_finished_frames_are_known_by_hash_and_those_of_older_versions_taken_ove
     write_open_frame(path, frame)
     assert FrameLedger(tmp_path, 3).has(path, POSE.pose)  # no ledger knew of it
     assert not FrameLedger(tmp_path, 3).has(path, POSE.pose + 0.1)
-    write_open_frame(path, replace(frame, cloth=cloth + 0.01))  # sound, and not what was finished
+    write_open_frame(path, replace(frame, cloth=cloth + 0.01))  # valid, and not what was finished
     assert not FrameLedger(tmp_path, 3).has(path, POSE.pose)
     assert not FrameLedger(tmp_path, 3).has(path, POSE.pose, history=2)
     FrameLedger(tmp_path, 3).note(path, POSE.pose)

@@ -93,8 +93,8 @@ def test_outfits_count_once_in_whatever_processes_they_are(two):
 
 @pytest.mark.slow
 def test_a_bad_frame_of_one_process_costs_all_the_step_and_no_more(two):
-    broken, sound = zip(*(facts(two, rank)["bad"] for rank in (0, 1)))
-    assert not any(map(math.isfinite, broken)) and sound[0] == sound[1] and math.isfinite(sound[0])
+    broken, valid = zip(*(facts(two, rank)["bad"] for rank in (0, 1)))
+    assert not any(map(math.isfinite, broken)) and valid[0] == valid[1] and math.isfinite(valid[0])
 
 
 def test_a_process_alone_is_a_world_of_one(monkeypatch):
