@@ -62,9 +62,7 @@ class SimulateConfig:
     train: int | None = None  # settled frames, half of everyday and half of random poses
     test: int | None = None  # settled frames of authored sequences
     interpolation: int | None = None  # settled frames of unseen random poses, a test split of its own
-    train_motions: list[FileName] = field(
-        default_factory=list
-    )  # everyday families, authored sequences, files
+    train_motions: list[FileName] = field(default_factory=list)  # everyday families, authored sequences, files
     test_motions: list[FileName] = field(default_factory=list)  # the same for the test split
     settled: bool = False  # record motion files as settled poses, spread over them, not as continuous sequences
     fps: float = 30.0  # frames per second of continuous sequences
