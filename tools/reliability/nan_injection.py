@@ -14,6 +14,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from avatar.checks import AvatarError
 from avatar.io.checkpoints import named_tensors
 from avatar.methods.canonicalizer import CanonicalizerTask
 from avatar.methods.points import PointTask
@@ -61,7 +62,7 @@ def nan_trial(root: Path, injections: int, seed: int) -> list[Finding]:
 def train_with_nan(job: str, root: Path, name: str, place: str, once: bool, step: int) -> None:
     """Trains with NaN or infinity injected in one place at a step, or from it on.
 
-    Writes ``<root>/<name>.injected`` where a step's loss or gradients were not finite, and ``<root>/<name>.spread``
+    Writes ``<root>/<name>.injected`` where a step's loss or gradients were not finite or it was refused, and ``<root>/<name>.spread``
     where such a step changed a weight, a statistic or a moment.
     """
     state = {"step": -1, "trainer": None}
@@ -77,14 +78,20 @@ def train_with_nan(job: str, root: Path, name: str, place: str, once: bool, step
                 largest.data.view(-1)[0] = math.nan  # a small one, such as a frame's code, is in few batches
             if place == "scan point" and due():
                 inputs = (inject_into_points(inputs[0]), *inputs[1:])
-            before = bits(state_of(trainer)) if due() else {}
-            result = real(trainer, inputs)
-            if before:
-                if not math.isfinite(float(result[-1]) + float(result[0].total.detach())):
-                    (root / f"{name}.injected").touch()
-                after = bits(state_of(trainer))
-                if any(after.get(place, old) != old for place, old in before.items()):
-                    (root / f"{name}.spread").touch()
+            before, refused = bits(state_of(trainer)) if due() else {}, False
+            try:
+                result = real(trainer, inputs)
+                refused = not math.isfinite(float(result[-1]) + float(result[0].total.detach()))
+            except AvatarError:  # as searches give for points that are not finite, or the trainer after many such steps
+                refused = True
+                raise
+            finally:
+                if before:
+                    if refused:
+                        (root / f"{name}.injected").touch()
+                    after = bits(state_of(trainer))
+                    if any(after.get(place, old) != old for place, old in before.items()):
+                        (root / f"{name}.spread").touch()
             return result
 
         return train_step
