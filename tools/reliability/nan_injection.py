@@ -62,8 +62,8 @@ def nan_trial(root: Path, injections: int, seed: int) -> list[Finding]:
 def train_with_nan(job: str, root: Path, name: str, place: str, once: bool, step: int) -> None:
     """Trains with NaN or infinity injected in one place at a step, or from it on.
 
-    Writes ``<root>/<name>.injected`` where a step's loss or gradients were not finite or it was refused, and ``<root>/<name>.spread``
-    where such a step changed a weight, a statistic or a moment.
+    Writes ``<root>/<name>.injected`` where a step's loss or gradients were not finite or it was refused, and
+    ``<root>/<name>.spread`` where such a step changed a weight, a statistic or a moment.
     """
     state = {"step": -1, "trainer": None}
 
