@@ -148,7 +148,11 @@ class Trainer:
         for group, rate in zip(self.optimiser.param_groups, stage.rates):
             group["lr"] = rate * factor
         before = [statistic.clone() for statistic in self.statistics]
-        terms = self.task.loss(inputs, position)
+        try:
+            terms = self.task.loss(inputs, position)
+        except AvatarError:  # of a search among points that are not finite
+            self.restore_statistics(before)
+            raise
         self.optimiser.zero_grad(set_to_none=True)
         terms.total.backward()
         total = terms.total.detach().clone()
@@ -160,13 +164,17 @@ class Trainer:
             self.optimiser.step()
             self.bad_steps = 0
         else:
-            self.reject_step(inputs, before)
+            self.restore_statistics(before)
+            self.count_bad_step(inputs)
         return terms, stage.rates[0] * factor, norm
 
-    def reject_step(self, inputs: Inputs, statistics: list[Tensor]) -> None:
-        """Restores running statistics after a step that was not finite; ends training after too many in a row."""
-        for statistic, value in zip(self.statistics, statistics):
+    def restore_statistics(self, values: list[Tensor]) -> None:
+        """Puts back the running statistics from before a step that was not finite."""
+        for statistic, value in zip(self.statistics, values):
             statistic.copy_(value)
+
+    def count_bad_step(self, inputs: Inputs) -> None:
+        """Ends training after too many steps in a row that were not finite."""
         self.bad_steps += 1
         if self.bad_steps > MAX_BAD_STEPS:
             where = f"(step {self.step}, frames {', '.join(self.task.frame_names(inputs))})"

@@ -297,6 +297,18 @@ def test_a_bad_step_leaves_no_trace(tmp_path):
     trainer.save(0.0)
 
 
+def test_a_step_that_a_search_refuses_leaves_running_statistics_as_they_were(tmp_path):
+    trainer = make_trainer(tmp_path, steps=30)
+    samples = trainer.task.fixed_points
+    trainer.train_step((random_batch(), samples))
+    before = {name: value.clone() for name, value in trainer.model.state_dict().items()}
+    good = random_batch()
+    broken = replace(good, scan_points=torch.full_like(good.scan_points, float("nan")))
+    with pytest.raises(AvatarError, match="finite"):
+        trainer.train_step((broken, samples))
+    assert all(torch.equal(value, before[name]) for name, value in trainer.model.state_dict().items())
+
+
 def test_wrong_options_are_refused_by_name():
     for option in ({"steps": 0}, {"lr": 0.0}, {"minutes": -1.0}, {"clip": 0.0}, {"warmup": -1}):
         with pytest.raises(AvatarError, match=next(iter(option))):
