@@ -49,9 +49,9 @@ def in_workers(
             for future in as_completed(futures):
                 yield futures[future], future.result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
                 process.terminate()
+            pool.shutdown(cancel_futures=True)  # waits for its thread, whose pipes Python's exit writes to
             raise
 
 

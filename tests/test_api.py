@@ -72,7 +72,7 @@ def test_scores_of_two_surfaces():
     found = api.score(Surface(cloud), larger, ["cd_point", "normal_l1_mean"])
     assert found["cd_point"] == pytest.approx(2 * 0.1**2, rel=0.05) and found["normal_l1_mean"] < 0.05
     assert api.score(cloud, cloud) == {"cd_point": 0.0, "normal_l1_mean": 0.0, "f_score_5mm": 1.0}
-    for name in ("penetration_share", "jitter"):
+    for name in ("penetration_share", "jitter", "self_intersection"):
         with pytest.raises(AvatarError, match=name):
             api.score(cloud, cloud, [name])
 

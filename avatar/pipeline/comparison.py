@@ -46,7 +46,10 @@ class CompareConfig:
     dataset: tuple[str, ...] = ("sample",)  # where runs are not listed: one or several
     name: str = "default"  # and runs of this name
     methods: tuple[str, ...] = ("static", "closet")  # columns of the table, in this order
-    metrics: tuple[str, ...] = ("cd_point", "cd_pop", "normal_l1_mean", "penetration_share", "uniformity")  # in it
+    metrics: tuple[str, ...] = (  # in it, as far as they were scored
+        *("cd_point", "cd_pop", "normal_l1_mean", "normal_map", "silhouette", "holes", "penetration_share"),
+        "uniformity",
+    )
     form: FormConfig | None = None  # of one table of all metrics; null gives outfits by methods, a table a metric
     baseline: str = ""  # the method that others are set against, with bootstrap intervals; empty for none
     resamples: int = 2000  # of the bootstrap

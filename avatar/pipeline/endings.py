@@ -22,7 +22,7 @@ def find_ending(verb: str, config: Any, result: Any) -> tuple[list[Path], list[s
         case "simulate":
             from avatar.simulate.recording import dressed_outfits
 
-            if config.history:
+            if config.history or config.distances:
                 return [], []
             root, names = config.root, [name for name, _ in dressed_outfits(config)]
             where = [f"dataset={root.name}", f"outfit={names[0]}", *_data_root(root.parent)]
@@ -68,7 +68,7 @@ def _data_root(folder: Path) -> list[str]:
 def report_ending(verb: str, config: Any, result: Any, seconds: float) -> None:
     """Logs how a verb ended: what it made, and the commands that may follow, ready for the shell."""
     made, following = find_ending(verb, config, result)
-    if verb in RESUMED and not WORK["step"] and not WORK["made"]:
+    if verb in RESUMED and made and not WORK["step"] and not WORK["made"]:
         report.info("%s: finished already, nothing was left to do.", verb)
     else:
         counts = {"steps": WORK["step"], "made": WORK["made"], "finished before": WORK["found"]}

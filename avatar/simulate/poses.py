@@ -20,6 +20,7 @@ from avatar.simulate.sequences import SEQUENCES, authored_motion
 
 CLEARANCE = 0.03  # metres kept between forearms, hands, legs and the rest, so that cloth finds room
 APART = 0.5  # radians, norm over all joints' axis-angles: no training pose is nearer to a frame of a test motion
+STRAIGHT, UPRIGHT = 15.0, 20.0  # degrees of knees and of hips, up to which legs count as straight
 KINDS = ("train", "test", "interpolation")
 
 
@@ -127,6 +128,37 @@ def accepted_poses(angles: Callable[[int], Angles], count: int) -> list[np.ndarr
             return kept[:count]
         drawn *= 2
     raise AvatarError(f"count: expected poses that do not touch themselves, found too few for {count}.")
+
+
+@torch.no_grad()
+def split_distances(poses: dict[str, list[NamedPose]], shape: str = "female") -> list[str]:
+    """Lines on how far each split's poses are from the nearest training pose, and how many have straight legs.
+
+    A distance is the mean over an open body's vertices, its root turned alike; legs are straight where all knees are
+    bent by less than `STRAIGHT` and all hips by less than `UPRIGHT`.
+
+    Raises:
+        AvatarError: without training poses.
+    """
+    if "train" not in poses:
+        raise AvatarError(
+            f"train: expected poses to measure from, got those of {', '.join(poses) or 'no split'} alone."
+        )
+    body, lines = open_body(shape), []
+    knees, hips = ([SMPL_JOINTS.index(f"{side}_{name}") for side in ("left", "right")] for name in ("knee", "hip"))
+    for split, named in {"train": poses["train"], **poses}.items():
+        angles = torch.from_numpy(np.stack([pose.pose for pose in named]).astype(np.float32))
+        bent = torch.rad2deg(angles.norm(dim=-1))
+        straight = (bent[:, knees] < STRAIGHT).all(dim=1) & (bent[:, hips] < UPRIGHT).all(dim=1)
+        angles[:, 0] = 0
+        posed = body(angles).vertices
+        lines.append(f"{split}: {len(named)} poses, {int(straight.sum())} with straight legs")
+        if split == "train":
+            training = posed
+        else:
+            nearest = [(training - one).norm(dim=-1).mean(dim=-1).min() for one in posed]
+            lines[-1] += f"; {100 * float(torch.stack(nearest).mean()):.1f} cm to the nearest training pose"
+    return lines
 
 
 def _authored_poses(count: int, seed: int) -> list[NamedPose]:

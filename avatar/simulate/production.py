@@ -43,7 +43,7 @@ class FrameLedger:
     def has(self, path: Path, pose: np.ndarray, history: int = 0) -> bool:
         """Whether a frame is there as it was written."""
         name, key = self._identify(path, pose, history)
-        if name in self.ledger.entries or not is_sound(path, pose, self.vertices, history):
+        if name in self.ledger.entries or not is_valid(path, pose, self.vertices, history):
             return self.ledger.find(name, key) is not None
         self.ledger.record(name, key, [path])
         return True
@@ -60,7 +60,7 @@ class FrameLedger:
         return path.relative_to(self.folder).as_posix(), digest_of(made_of)
 
 
-def is_sound(path: Path, pose: np.ndarray, vertex_count: int, history: int = 0) -> bool:
+def is_valid(path: Path, pose: np.ndarray, vertex_count: int, history: int = 0) -> bool:
     """Whether a frame is there, readable, of this pose, this outfit and this history."""
     try:
         frame = read_open_frame(path)
@@ -194,7 +194,8 @@ def simulate_outfit(
 
         jobs = [(job, folder / split) for split, jobs in work.items() for job in jobs]
         jobs = [job for job in jobs if not all(done.has(*frame) for frame in frames(*job))]
-        bar = {"total": len(jobs), "what": f"simulate {outfit.name} on {outfit.shape}", "silent": not progress}
+        what = f"simulate {outfit.name} on {outfit.shape}, {len(dressed.labels):,} cloth vertices"
+        bar = {"total": len(jobs), "what": what, "silent": not progress}
         if workers == 1 or len(jobs) < 2:
             made = ((job, record(dressed, *job, gates)) for job in jobs)
         else:

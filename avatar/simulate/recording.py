@@ -20,7 +20,7 @@ from avatar.simulate.everyday import EVERYDAY
 from avatar.simulate.gates import FrameReport, GateConfig
 from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.outfits import DEFAULT_SHAPES, OUTFIT_NAMES, OutfitConfig, outfit
-from avatar.simulate.poses import KINDS, NamedPose, draw_poses, everyday_poses
+from avatar.simulate.poses import KINDS, NamedPose, draw_poses, everyday_poses, split_distances
 from avatar.simulate.production import dress, simulate_outfit
 from avatar.simulate.sequences import SEQUENCES, authored_motion
 from avatar.values import FileName
@@ -55,7 +55,7 @@ class SimulateConfig:
     preset: str = "quick"  # quick, sample, full, motion
     root: Path = Path(
         "data/open"
-    )  # outfits go to <root>/<outfit>, on another than the usual body to <root>/<outfit>_<shape>; sequences to *_motion
+    )  # of folders <outfit>, <outfit>_<shape> on other bodies, <outfit>_motion of sequences
     outfits: list[str] = field(default_factory=list)  # tee, dress, shirt, skirt, jacket, coat, slacks, hoodie
     shapes: list[FileName] = field(default_factory=list)  # who wears them: female, male, files of tools/make_body.py
     edge: float | None = None  # m, target edge length of all garments; each garment's own if null
@@ -70,6 +70,7 @@ class SimulateConfig:
     seed: int = 0
     workers: int = 0  # processes; 0 is one a core
     history: int = 0  # poses on which history error and pose sensitivity are measured instead of recording
+    distances: bool = False  # measure how far the poses of the splits are apart instead of recording
     progress: bool = True
     travel: TravelConfig = field(default_factory=TravelConfig)
     gates: GateConfig = field(default_factory=GateConfig)
@@ -163,6 +164,10 @@ def simulate(config: SimulateConfig) -> list[FrameReport]:
     Returns:
         Reports of the frames made in this run; those refused by the gates say why and are logged as warnings.
     """
+    if config.distances:
+        for line in split_distances(settled_poses(config)):
+            log.info("%s", line)
+        return []
     workers = config.workers or len(os.sched_getaffinity(0))
     preset = PRESETS[config.preset]
     sources = {

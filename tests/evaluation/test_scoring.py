@@ -99,12 +99,13 @@ def test_meshes_take_the_place_of_points_in_surface_metrics(ball, predictions, t
     faces, scale = ball.template.faces, 1.05 / 0.9
     for name in ball.names:
         write_mesh(tmp_path / "meshes" / f"{name}.obj", Mesh(ball.vertices * scale, faces))
-    scores = score_predictions(
-        predictions, ball, "test", ScoreConfig(metrics=FAST), Label("closet"), meshes=tmp_path / "meshes"
-    )
+    config = ScoreConfig(metrics=[*FAST, "self_intersection"])
+    scores = score_predictions(predictions, ball, "test", config, Label("closet"), meshes=tmp_path / "meshes")
     assert value(scores, "s2m_cm") == pytest.approx(5, abs=0.15)
-    plain = score_predictions(predictions, ball, "test", ScoreConfig(metrics=FAST), Label("closet"))
+    assert value(scores, "self_intersection") == 0
+    plain = score_predictions(predictions, ball, "test", config, Label("closet"))
     assert value(scores, "cd_point") == value(plain, "cd_point")
+    assert "self_intersection" not in {row.metric for row in plain.rows}  # points have no faces
 
 
 def test_penetration_needs_a_template_and_is_left_out_with_a_warning(ball_without_truth, predictions, caplog):

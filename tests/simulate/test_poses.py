@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from avatar.body.model import SMPL_JOINTS
@@ -11,7 +12,16 @@ from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.simulate.angles import CENTRAL, LIMITS, pose_from_angles
 from avatar.simulate.everyday import EVERYDAY, everyday_angles
-from avatar.simulate.poses import APART, KINDS, clear_of_itself, draw_poses, everyday_poses, random_angles
+from avatar.simulate.poses import (
+    APART,
+    KINDS,
+    NamedPose,
+    clear_of_itself,
+    draw_poses,
+    everyday_poses,
+    random_angles,
+    split_distances,
+)
 from avatar.simulate.sequences import SEQUENCES, authored_motion
 
 
@@ -167,3 +177,21 @@ def test_poses_that_touch_themselves_are_found():
 def test_bad_requests_are_refused(call, message):
     with pytest.raises(AvatarError, match=message):
         call()
+
+
+def test_distances_of_splits_are_to_the_nearest_training_pose_and_count_straight_legs():
+    rest, bent = np.zeros((22, 3), np.float32), np.zeros((22, 3), np.float32)
+    bent[SMPL_JOINTS.index("left_knee"), 0] = 1.0
+    turned = rest.copy()
+    turned[0, 1] = 2.0  # the root's turn makes no difference
+    poses = {"train": [NamedPose("a", rest)], "test": [NamedPose("b", bent), NamedPose("c", turned)]}
+    body = open_body("female")
+    moved, still = (body(torch.from_numpy(pose[None])).vertices[0] for pose in (bent, rest))
+    apart = 100 * float((moved - still).norm(dim=-1).mean()) / 2  # the mean of two poses, of which one is not apart
+    assert split_distances(poses) == [
+        "train: 1 poses, 1 with straight legs",
+        f"test: 2 poses, 1 with straight legs; {apart:.1f} cm to the nearest training pose",
+    ]
+    assert apart > 1
+    with pytest.raises(AvatarError, match="train: expected poses to measure from, got those of test"):
+        split_distances({"test": poses["test"]})

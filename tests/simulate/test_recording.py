@@ -17,7 +17,7 @@ from avatar.simulate.dressing import Rest, bind_pose, pose_path
 from avatar.simulate.gates import GateConfig, edge_stretch, frames_of, missed, record_frame, record_motion
 from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.poses import KINDS, NamedPose, everyday_poses
-from avatar.simulate.production import FrameLedger, is_sound, subject
+from avatar.simulate.production import FrameLedger, is_valid, subject
 from avatar.simulate.recording import (
     PRESETS,
     SimulateConfig,
@@ -185,13 +185,13 @@ def test_pose_sensitivity_compares_cloth_with_body():
 
 def test_only_sound_frames_are_kept(tmp_path):
     path = tmp_path / "f.npz"
-    assert not is_sound(path, POSE.pose, 3)
+    assert not is_valid(path, POSE.pose, 3)
     cloth = np.zeros((3, 3), np.float32)
     write_open_frame(path, OpenFrame(POSE.pose, np.zeros(3), cloth, np.ones(4, bool), np.ones(1, bool)))
-    assert is_sound(path, POSE.pose, 3)
-    assert not is_sound(path, POSE.pose + 0.1, 3) and not is_sound(path, POSE.pose, 4)
+    assert is_valid(path, POSE.pose, 3)
+    assert not is_valid(path, POSE.pose + 0.1, 3) and not is_valid(path, POSE.pose, 4)
     path.write_bytes(path.read_bytes()[:-20])
-    assert not is_sound(path, POSE.pose, 3)
+    assert not is_valid(path, POSE.pose, 3)
 
 
 def test_finished_frames_are_known_by_hash_and_those_of_older_versions_taken_over(tmp_path):
@@ -224,8 +224,8 @@ def test_frames_of_a_sequence_say_how_many_went_before(tmp_path, examined):
     assert len(record_motion(dressed, motion, tmp_path, GateConfig())) == 3
     found = [read_open_frame(tmp_path / f"kick.{frame:05d}.npz").history for frame in range(3)]
     assert found == [0, 1, 2]
-    assert is_sound(tmp_path / "kick.00002.npz", motion.poses[2], 3, history=2)
-    assert not is_sound(tmp_path / "kick.00002.npz", motion.poses[2], 3)
+    assert is_valid(tmp_path / "kick.00002.npz", motion.poses[2], 3, history=2)
+    assert not is_valid(tmp_path / "kick.00002.npz", motion.poses[2], 3)
 
 
 def test_everyday_sequences_pass_their_poses_smoothly():
