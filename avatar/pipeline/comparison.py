@@ -34,6 +34,10 @@ from avatar.settings import settings_from_dict
 
 log = logging.getLogger(__name__)
 PICTURE = (400, 600)
+USUAL_METRICS = (
+    *("cd_point", "cd_pop", "normal_l1_mean", "normal_map", "silhouette", "holes"),
+    *("penetration_share", "uniformity"),
+)
 
 
 @dataclass
@@ -46,10 +50,7 @@ class CompareConfig:
     dataset: tuple[str, ...] = ("sample",)  # where runs are not listed: one or several
     name: str = "default"  # and runs of this name
     methods: tuple[str, ...] = ("static", "closet")  # columns of the table, in this order
-    metrics: tuple[str, ...] = (  # in it, as far as they were scored
-        *("cd_point", "cd_pop", "normal_l1_mean", "normal_map", "silhouette", "holes", "penetration_share"),
-        "uniformity",
-    )
+    metrics: tuple[str, ...] = USUAL_METRICS  # in it, as far as they were scored
     form: FormConfig | None = None  # of one table of all metrics; null gives outfits by methods, a table a metric
     baseline: str = ""  # the method that others are set against, with bootstrap intervals; empty for none
     resamples: int = 2000  # of the bootstrap
