@@ -24,7 +24,7 @@ from avatar.evaluation.canonical_truth import (
     repose,
     unpose_truly,
 )
-from avatar.evaluation.closest import closest_on_mesh
+from avatar.geometry.closest import closest_on_mesh
 from avatar.evaluation.metrics import CENTIMETRES, PERCENT, Metric
 from avatar.evaluation.scores import FrameScore, Score, Scores
 from avatar.evaluation.scoring import Label, mean_scores, remember

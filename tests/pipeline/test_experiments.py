@@ -97,7 +97,7 @@ def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatc
     other = replace(jobs[1], score=replace(jobs[1].score, seed=5))
     assert again(other) == 3 and (run / "scores.csv").read_bytes() != before[run / "scores.csv"]
     assert again(jobs[1]) == 0
-    change_source("avatar.evaluation.closest")
+    change_source("avatar.geometry.closest")
     assert again(jobs[1]) == 3 and again(jobs[1]) == 0
     assert before == {path: path.read_bytes() for path in before}
 
