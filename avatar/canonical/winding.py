@@ -9,6 +9,7 @@ scans' insides: one closed surface with outward normals.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import scipy.fft
@@ -125,8 +126,11 @@ class Winding:
 
     def gradient_at(self, points: np.ndarray) -> np.ndarray:
         """The gradient ``(N, 3)`` at points ``(N, 3)``, per metre, by central differences of one grid spacing."""
-        steps = self.spacing * np.eye(3)
-        return np.stack([(self.at(points + s) - self.at(points - s)) / (2 * self.spacing) for s in steps], axis=1)
+        return np.stack([self._look_up(slope, points) for slope in self._slopes], axis=1)
+
+    @cached_property
+    def _slopes(self) -> list[np.ndarray]:
+        return np.gradient(self.numbers, self.spacing)
 
     def vectors_at(self, kind: int, points: np.ndarray) -> np.ndarray:
         """Mean area vectors of a kind ``(N, 3)`` per metre at points ``(N, 3)``."""
@@ -160,7 +164,7 @@ class Winding:
         total = np.zeros(len(points))
         start = -self.gradient_at(points)
         start /= np.maximum(np.linalg.norm(start, axis=1, keepdims=True), 1e-9)
-        step = self.spacing / 2
+        step = self.spacing
         for side in (1.0, -1.0):
             places, going = points + side * step / 2 * start, np.arange(len(points))
             directions = start

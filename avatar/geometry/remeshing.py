@@ -13,8 +13,10 @@ from avatar.geometry.laplacians import boundary_edges
 from avatar.records import Mesh
 
 LONG, SHORT = 4 / 3, 4 / 5  # of the wanted length: edges beyond are split and collapsed (Botsch and Kobbelt 2004)
-ROUNDS = 12  # of collapses and of flips an iteration, at most; each takes a set of edges that do not touch
+ROUNDS = 8  # of collapses and of flips an iteration, at most; each takes a set of edges that do not touch
+FLATTER = 0.3  # of the lower of two triangles' heights that a flip must leave
 UPRIGHT = 0.2  # cosine between a triangle's normals before and after a change, at least
+TAUBIN = (0.5, -0.53)  # factors of a smoothing and a widening step
 NEAREST = 1e-3  # share of an edge that a cut keeps away from its ends
 
 
@@ -264,26 +266,25 @@ def flip_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Flips edges wherever that brings the numbers of neighbours nearer to six (four on a border)."""
     for _ in range(ROUNDS):
         edges = find_edges(faces, len(vertices))
-        inner = np.flatnonzero(edges.faces[:, 1] >= 0)
         valence = np.bincount(edges.ends.reshape(-1), minlength=len(vertices))
         excess = valence - np.where(edges.border, 4, 6)
-        (a, b), (c, d) = edges.ends[inner].T, edges.across[inner].T
-        now = np.square(excess[[a, b, c, d]]).sum(axis=0)
-        then = np.square([excess[a] - 1, excess[b] - 1, excess[c] + 1, excess[d] + 1]).sum(axis=0)
-        # face 0 holds a, b and c in its own sense; what it runs through first is known from where c stands
+        pairs = np.concatenate([edges.ends, edges.across], axis=1).T
+        now = np.square(excess[pairs]).sum(axis=0)
+        then = np.square(excess[pairs] + np.array([[-1], [-1], [1], [1]])).sum(axis=0)
+        inner = np.flatnonzero((edges.faces[:, 1] >= 0) & (then < now))
+        now, then, (c, d) = now[inner], then[inner], edges.across[inner].T
+        # where c stands in the first face tells in which sense that face runs along the edge
         first = faces[edges.faces[inner, 0]]
         at = (first == c[:, None]).argmax(axis=1)
         a, b = first[np.arange(len(at)), (at + 1) % 3], first[np.arange(len(at)), (at + 2) % 3]
+        before = np.stack([first, faces[edges.faces[inner, 1]]], axis=1)
         new = np.stack([np.stack([c, a, d], axis=1), np.stack([d, b, c], axis=1)], axis=1)
-        old = _face_normals(vertices, first) + _face_normals(vertices, faces[edges.faces[inner, 1]])
-        joined = _neighbours(edges, len(vertices))
-        linked = np.asarray(joined[c, d]).reshape(-1) > 0
-        good = (then < now) & ~linked & (c != d) & (np.minimum(valence[a], valence[b]) > 3)
+        old = _face_normals(vertices, before[:, 0]) + _face_normals(vertices, before[:, 1])
+        linked = np.asarray(_neighbours(edges, len(vertices))[c, d]).reshape(-1) > 0
+        good = ~linked & (c != d) & (np.minimum(valence[a], valence[b]) > 3)
         for side in range(2):
             good &= _upright(old, _face_normals(vertices, new[:, side]))
-        good &= _shortest_height(vertices, new) > 0.3 * _shortest_height(
-            vertices, np.stack([first, faces[edges.faces[inner, 1]]], axis=1)
-        )
+        good &= _shortest_height(vertices, new) > FLATTER * _shortest_height(vertices, before)
         candidates = np.flatnonzero(good)
         if not len(candidates):
             break
@@ -333,3 +334,25 @@ def relax(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     onward = np.einsum("vi,vi->v", onward, along)[:, None] * along
     step = np.where(edges.border[:, None], np.where(simple[:, None], onward, 0), step)
     return vertices + step
+
+
+def smooth_borders(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
+    """Vertices whose borders are smoothed as curves, with little shrinking (Taubin 1995); all others stay.
+
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        rounds: pairs of a smoothing and a widening step; waves shorter than about ``4 sqrt(rounds)`` edges go.
+    """
+    around = boundary_edges(faces)
+    after, before = np.full((2, len(vertices)), -1)
+    after[around[:, 0]] = around[:, 1]
+    before[around[:, 1]] = around[:, 0]
+    once = np.bincount(around[:, 0], minlength=len(vertices)) == 1
+    moving = np.flatnonzero(once & (np.bincount(around[:, 1], minlength=len(vertices)) == 1))
+    vertices = vertices.copy()
+    for _ in range(rounds):
+        for factor in TAUBIN:
+            middle = (vertices[after[moving]] + vertices[before[moving]]) / 2
+            vertices[moving] += factor * (middle - vertices[moving])
+    return vertices
