@@ -118,6 +118,26 @@ class CanonicalScan:
 
 
 @dataclass(frozen=True)
+class ClothedTemplate:
+    """One outfit at rest in the canonical pose as one mesh: the body's own skin where it is bare, and the garment.
+
+    ``vertices (V, 3)`` metres, ``faces (F, 3)``, ``weights (V, J)`` skinning weights with rows summing to 1,
+    ``body_vertex (V,)`` the body's vertex that each skin vertex is, -1 for the garment's. No face joins the two: skin
+    goes on below the garment's edge.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+    body_vertex: np.ndarray
+
+    @property
+    def garment_faces(self) -> np.ndarray:
+        """Which faces ``(F,)`` are garment, bool."""
+        return (self.body_vertex[self.faces] < 0).all(axis=1)
+
+
+@dataclass(frozen=True)
 class Frame:
     """One scan with its body. ``name`` is ``<sequence>.<frame>``, unique within outfit and split."""
 

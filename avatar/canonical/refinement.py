@@ -151,7 +151,9 @@ def refine(
     logs = torch.log(torch.as_tensor(weights).float().clamp(min=1e-6))
     moved = torch.zeros_like(start, requires_grad=True)
     changed = torch.zeros_like(logs, requires_grad=True)
-    optimiser = torch.optim.Adam([{"params": [moved], "lr": config.rate}, {"params": [changed], "lr": config.weight_rate}])
+    optimiser = torch.optim.Adam(
+        [{"params": [moved], "lr": config.rate}, {"params": [changed], "lr": config.weight_rate}]
+    )
     generator, rng = torch.Generator().manual_seed(config.seed), np.random.default_rng(config.seed)
     losses = []
     for step in range(config.steps):

@@ -24,11 +24,11 @@ from avatar.evaluation.canonical_truth import (
     repose,
     unpose_truly,
 )
-from avatar.geometry.closest import closest_on_mesh
 from avatar.evaluation.metrics import CENTIMETRES, PERCENT, Metric
 from avatar.evaluation.scores import FrameScore, Score, Scores
 from avatar.evaluation.scoring import Label, mean_scores, remember
 from avatar.evaluation.tables import Table, tabulate_metrics
+from avatar.geometry.closest import closest_on_mesh
 from avatar.io.ledger import Ledger
 from avatar.progress import tracked
 from avatar.records import Frame, Mesh, Template
