@@ -42,6 +42,13 @@ VERBS = {
         options="dataset outfit canonicalizer_size name weights scored "
         "pictures train.first_steps train.second_steps data_root runs_root device",
     ),
+    "template": Verb(
+        "makes an outfit's clothed template from its canonical scans",
+        "avatar.pipeline.templating:template",
+        "avatar.runs.templating:TemplateConfig",
+        options="dataset outfit canonical clothed.edge clothed.weights clothed.mirror clothed.refine.steps "
+        "pictures data_root runs_root",
+    ),
     "train": Verb(
         "trains an avatar, or goes on with it",
         "avatar.runs.training:train",

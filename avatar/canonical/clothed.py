@@ -1,4 +1,4 @@
-"""The clothed template: canonical scans of one outfit to one mesh, the body's own skin where it is bare, garment beyond.
+"""The clothed template: canonical scans of one outfit to one mesh of the body's own skin and a garment.
 
 Four steps, each a function on arrays: `find_skin` (where scans lie on the body), `fuse_garment` (mean winding number,
 open hems, even triangles), `weigh_garment` (skinning weights and their measure), `assemble` (skin and garment in one).
@@ -124,6 +124,12 @@ def _untracked(items: Sequence, _: str) -> Iterable:
     return items
 
 
+def check_any(scans: Sequence) -> None:
+    """Refuses to make a template of nothing. Raises `AvatarError`."""
+    if not len(scans):
+        raise AvatarError("scans: expected at least one canonical scan, got none. Hint: run tools/canonicalize.py.")
+
+
 def find_skin(
     scans: Sequence[ScanInPose], template: Template, config: ClothedConfig, track: Track = _untracked
 ) -> SkinVote:
@@ -132,10 +138,7 @@ def find_skin(
     Raises:
         AvatarError: without scans, or when none comes near the body.
     """
-    if not len(scans):
-        raise AvatarError(
-            "scans: expected at least one canonical scan, got none. Hint: run tools/canonicalize.py first."
-        )
+    check_any(scans)
     rows = [body_offsets(*scan.posed, scan.body, scan.body_normals) for scan in track(scans, "skin")]
     return vote_skin(np.stack(rows), template, config.smooth, config.smallest_skin)
 
@@ -160,10 +163,7 @@ def fuse_garment(
     Raises:
         AvatarError: without scans, when they agree on no inside, or need too fine a grid.
     """
-    if not len(scans):
-        raise AvatarError(
-            "scans: expected at least one canonical scan, got none. Hint: run tools/canonicalize.py first."
-        )
+    check_any(scans)
     fused = fuse_scans(scans, template, vote, config, track)
     surface = fused.surface(config.level)
     support = fused.support(surface.vertices)

@@ -20,7 +20,7 @@ FEWEST_KEPT = 8  # largest weights kept a vertex
 
 
 def body_weights_at(points: np.ndarray, template: Template) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights ``(N, J)`` of the closest points of the body's surface, their distances ``(N,)`` and normals ``(N, 3)``."""
+    """Weights ``(N, J)``, distances ``(N,)`` and normals ``(N, 3)`` of the closest points of the body's surface."""
     vertices, faces = template.vertices.numpy().astype(np.float64), template.faces.numpy()
     hits = closest_on_mesh(points, vertices, faces)
     corners = faces[hits.face_ids]
@@ -66,7 +66,7 @@ def diffuse_weights(mesh: Mesh, template: Template) -> np.ndarray:
     """Weights ``(V, J)`` of a garment by heat that the body gives to it, the more the closer it is (as bone heat).
 
     Solves ``(L + M H) W = M H B`` with B the closest point's weights and H one over the squared distance to it: close
-    cloth keeps the body's weights, far cloth blends those of all the body around it. Positive and summing to 1 as it is.
+    cloth keeps the body's weights, far cloth blends those of all the body around it. Positive, and sums to 1.
 
     Args:
         mesh: the garment in the canonical pose.

@@ -136,8 +136,8 @@ def refine(
 
     Chamfer distance both ways between points of the garment and of the scans, a few scans a step. Displacements and
     changes of the weights' logarithms pass through `SmoothFields`. A static mesh cannot follow what a pose does to the
-    cloth; what it can take from the scans is their mean over poses. Judge it by its looks as well: with little smoothing
-    the same distance falls further and the surface is shredded.
+    cloth; what it can take from the scans is their mean over poses. Judge it by its looks as well: with little
+    smoothing the same distance falls further and the surface is shredded.
 
     Args:
         mesh: the garment in the canonical pose.

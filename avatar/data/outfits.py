@@ -94,6 +94,10 @@ class Outfit(ABC):
         check_frame(frame, self.template, path)
         return frame
 
+    def load_body(self, split: str, name: str) -> BodyFit:
+        """The body under a frame; errors as in `load`."""
+        return self.load(split, name).body
+
     def frame_path(self, split: str, name: str) -> Path:
         """The file of one of the outfit's frames. Raises `AvatarError` for a name that is not among them."""
         names = self.frames(split)

@@ -11,7 +11,16 @@ from avatar.invocation import activation_line, command_line, interpreter, shorte
 from avatar.progress import WORK, in_words
 from avatar.values import option
 
-RESUMED = ("simulate", "canonicalize", "train", "predict", "evaluate", "mesh", "experiment")  # skip what is finished
+RESUMED = (
+    "simulate",
+    "canonicalize",
+    "template",
+    "train",
+    "predict",
+    "evaluate",
+    "mesh",
+    "experiment",
+)  # skip what is finished
 SPLITS = ("train", "test", "interpolation", "validation")
 report = logging.getLogger(__name__)
 
@@ -31,6 +40,8 @@ def find_ending(verb: str, config: Any, result: Any) -> tuple[list[Path], list[s
             where = [f"dataset={config.dataset}", f"outfit={config.outfit}", f"canonical={config.name}"]
             made = [result / "scans", result / "pictures", *([result / "scores.md"] if config.scored else [])]
             return made, [command_line("train", "method=scanimate", *where, *_data_root(config.data_root))]
+        case "template":
+            return [result / name for name in ("template.npz", "template.ply", "pictures", "report.json")], []
         case "train" | "fit":
             return [result / "avatar.safetensors"], [command_line("predict", option("run", result))]
         case "predict":
