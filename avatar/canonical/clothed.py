@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from avatar.body.skinning import skin_transforms
 from avatar.canonical.clothed_weights import diffuse_weights, inpaint_weights, tidy_weights
+from avatar.canonical.posed import local_pose
 from avatar.canonical.refinement import PosedPoints, RefineConfig, chamfer, refine
 from avatar.canonical.skin import SkinVote, body_offsets, label_points, vote_skin
 from avatar.canonical.winding import Winding, area_vectors, grid_around
@@ -33,6 +34,7 @@ from avatar.records import CanonicalScan, ClothedTemplate, Mesh, Template
 
 FEWEST_POINTS = 500  # of a scan; with fewer its surface cannot be told from its noise
 OUTLIERS = 5e-4  # share of a scan's points that the grid may leave out on every side
+FEWEST_FUSED = 8  # scans; where there are fewer, all give the surface
 FEW_SCANS = 4  # below this many, points are blurred by their own spacing
 SKIN_SUPPORT = 0.1  # of a patch without garment, from which on it is skin or has skin going through it
 THROUGH = 0.05  # metres from a patch in which the body is looked for on both sides of it
@@ -62,6 +64,7 @@ class ClothedConfig:
     smallest_part: float = 0.01  # square metres; smaller separate parts of the garment are dropped and reported
     overlap: float = 0.03  # metres that skin goes on below the garment's edge; the two are not stitched
     clearance: float = 0.002  # metres that the garment keeps from the body at rest
+    closest: float = 0.4  # share of the scans, those posed nearest to the canonical pose, that give the surface
     mirror: bool = False  # add every scan's mirror image across x, for clothes that are symmetric
     weights: WeightKind = WeightKind.best
     held_back: float = 0.1  # share of the scans kept for measuring weights and refinement
@@ -75,9 +78,10 @@ class ClothedConfig:
                 f"spacing, edge: expected 0.002 and 0.004 to 0.5 metres, other lengths 0 to 0.5, got "
                 f"{wrong or {'spacing': self.spacing, 'edge': self.edge}}."
             )
-        if not 0.1 <= self.level <= 0.9 or not 0 <= self.held_back <= 0.5:
+        if not 0.1 <= self.level <= 0.9 or not 0 <= self.held_back <= 0.5 or not 0 < self.closest <= 1:
             raise AvatarError(
-                f"level, held_back: expected 0.1 to 0.9 and 0 to 0.5, got {self.level} and {self.held_back}."
+                f"level, held_back, closest: expected 0.1 to 0.9, 0 to 0.5 and up to 1, "
+                f"got {self.level}, {self.held_back} and {self.closest}."
             )
 
 
@@ -182,18 +186,20 @@ def fuse_garment(
 def fuse_scans(
     scans: Sequence[ScanInPose], template: Template, vote: SkinVote, config: ClothedConfig, track: Track = _untracked
 ) -> Winding:
-    """The mean winding number of all scans, their points told apart into skin and garment."""
+    """The mean winding number of the scans nearest to the canonical pose, told apart by skin and garment."""
     body = template.vertices.numpy()
     low, high, spacings = body.min(axis=0), body.max(axis=0), []
-    for scan in scans:
-        points = scan.scan.points
+    chosen = near_canonical(scans, template, config.closest)
+    for index in chosen:
+        points = scans[index].scan.points
         low = np.minimum(low, np.quantile(points, OUTLIERS, axis=0))
         high = np.maximum(high, np.quantile(points, 1 - OUTLIERS, axis=0))
     if config.mirror:
         low[0], high[0] = min(low[0], -high[0]), max(high[0], -low[0])
     grid = grid_around(low, high, config.spacing)
     across = np.array([-1.0, 1.0, 1.0])
-    for scan in track(scans, "fusion"):
+    for index in track(chosen, "fusion"):
+        scan = scans[index]
         vectors, garment = area_vectors(scan.scan), scan.garment_points(vote)
         spacings.append(float(np.sqrt(np.median(np.linalg.norm(vectors, axis=1)))))
         grid.add(scan.scan.points, vectors, garment)
@@ -201,6 +207,19 @@ def fuse_scans(
             grid.add(scan.scan.points * across, vectors * across, garment)
     few = grid.scans < FEW_SCANS
     return grid.solve(max(config.spacing, 1.5 * float(np.median(spacings)) if few else 0.0))
+
+
+def near_canonical(scans: Sequence[ScanInPose], template: Template, share: float) -> list[int]:
+    """Indices, ascending, of the share of the scans whose poses are nearest to the canonical one; eight at least.
+
+    What unposing gets wrong grows with the turn of the joints: a skirt over bent knees comes back with its hem drawn
+    up. By the mean square of the joints' turns against their parents.
+    """
+    count = min(len(scans), max(FEWEST_FUSED, round(share * len(scans))))
+    if count == len(scans):
+        return list(range(count))
+    turns = [float(local_pose(scan.joint_transforms, template.parents).square().mean()) for scan in scans]
+    return sorted(np.argsort(turns, kind="stable")[:count].tolist())
 
 
 def fill_holes(

@@ -13,7 +13,7 @@ from avatar.geometry.laplacians import boundary_edges
 from avatar.records import Mesh
 
 LONG, SHORT = 4 / 3, 4 / 5  # of the wanted length: edges beyond are split and collapsed (Botsch and Kobbelt 2004)
-ROUNDS = 8  # of collapses and of flips an iteration, at most; each takes a set of edges that do not touch
+ROUNDS = 30  # of collapses and of flips an iteration, at most; each takes a set of edges that do not touch
 FLATTER = 0.3  # of the lower of two triangles' heights that a flip must leave
 UPRIGHT = 0.2  # cosine between a triangle's normals before and after a change, at least
 TAUBIN = (0.5, -0.53)  # factors of a smoothing and a widening step

@@ -39,7 +39,10 @@ def find_ending(verb: str, config: Any, result: Any) -> tuple[list[Path], list[s
         case "canonicalize":
             where = [f"dataset={config.dataset}", f"outfit={config.outfit}", f"canonical={config.name}"]
             made = [result / "scans", result / "pictures", *([result / "scores.md"] if config.scored else [])]
-            return made, [command_line("train", "method=scanimate", *where, *_data_root(config.data_root))]
+            where += _data_root(config.data_root)
+            if config.runs_root != Path("runs"):
+                where.append(option("runs_root", config.runs_root))
+            return made, [command_line(*words, *where) for words in (("train", "method=scanimate"), ("template",))]
         case "template":
             return [result / name for name in ("template.npz", "template.ply", "pictures", "report.json")], []
         case "train" | "fit":

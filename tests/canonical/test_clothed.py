@@ -129,6 +129,12 @@ def icosphere(radius: float = 0.3, subdivisions: int = 3) -> Mesh:
     return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces, np.int64))
 
 
+def beside(first: Mesh, second: Mesh) -> Mesh:
+    """Two meshes as one, the second a metre away along every axis."""
+    faces = np.concatenate([first.faces, second.faces + len(first.vertices)])
+    return Mesh(np.concatenate([first.vertices, second.vertices + 1]), faces)
+
+
 def test_cotangent_laplacian_of_linear_and_square_functions():
     heights, widths = np.meshgrid(np.linspace(0, 1, 21), np.linspace(0, 1, 21), indexing="ij")
     corner = (np.arange(20)[:, None] * 21 + np.arange(20)).reshape(-1)
