@@ -159,9 +159,7 @@ def test_votes_are_smoothed_and_those_without_confidence_follow_their_neighbours
     smooth = smooth_votes(sphere.vertices, sphere.faces, votes, confidence, 0.05)
     clear = np.abs(sphere.vertices[:, 1]) > 0.03
     assert ((smooth > 0.5) == (sphere.vertices[:, 1] > 0))[clear].all()
-    apart = Mesh(
-        np.concatenate([sphere.vertices, sphere.vertices + 1]), np.concatenate([sphere.faces, sphere.faces + 642])
-    )
+    apart = beside(sphere, sphere)
     only_first = np.concatenate([np.ones(642), np.zeros(642)])
     both = smooth_votes(apart.vertices, apart.faces, only_first, only_first, 0.05)
     assert both[:642] == pytest.approx(1) and np.isnan(both[642:]).all()
@@ -311,20 +309,15 @@ def test_a_hole_of_all_scans_is_filled_and_an_opening_is_not(person):
 
 def test_small_parts_are_dropped_and_counted():
     large, small = icosphere(0.3), icosphere(0.02)
-    both = Mesh(
-        np.concatenate([large.vertices, small.vertices + 1]),
-        np.concatenate([large.faces, small.faces + len(large.vertices)]),
-    )
+    both = beside(large, small)
     kept, dropped = drop_small_parts(both, 0.01)
     assert len(kept.faces) == len(large.faces) and dropped == (pytest.approx(4 * np.pi * 0.0004, rel=0.02),)
 
 
 def test_skin_goes_on_below_the_garment_by_the_overlap(person):
     bare = person.vertices[:, 1].numpy() > 0.4
-    lowest = [
-        person.vertices[:, 1].numpy()[np.unique(skin_faces(person, bare, overlap))].min()
-        for overlap in (0.0, 0.05, 0.1)
-    ]
+    heights = person.vertices[:, 1].numpy()
+    lowest = [heights[np.unique(skin_faces(person, bare, overlap))].min() for overlap in (0.0, 0.05, 0.1)]
     assert 0.4 > lowest[0] > lowest[1] >= 0.3 and lowest[1] > lowest[2] >= 0.25
 
 
