@@ -90,6 +90,7 @@ SHORT = {
     "mesh": ("frames=1", "poisson.depth=6"),
     "report": ("frames=1",),
     "canonicalize": CANONICALIZER,
+    "template": ("pictures=1", "clothed.spacing=0.02", "clothed.edge=0.06", "clothed.refine.steps=2"),
     "demo": (
         *(*TRAIN, "points=2000", "score.scan_points=1000", "meshes=1", "static_share=1.0"),
         *(f"canonicalizer.{option}" for option in CANONICALIZER),
@@ -124,6 +125,7 @@ PROMISED = {
     "export": [f"{{run}}/export/{{predictions}}/*/{name}" for name in ("points.usdc", "body.glb", "preview.webp")],
     "report": ["{run}/report.html"],
     "canonicalize": ["runs/canonical/{dataset}/{outfit}/{name}/scans/t*/*.npz"],
+    "template": ["runs/canonical/{dataset}/{outfit}/{canonical}/template/template.*"],
     "demo": ["runs/demo/summary.json", "runs/closet/sample/{outfit}/demo/report.html"],
     "simulate": ["data/open/*/manifest.json"],
     "bench": ["**/bench.csv", "**/bench.md"],
@@ -139,6 +141,7 @@ USUAL = {
     "dataset": "sample",
     "outfit": "dress",
     "name": "default",
+    "canonical": "default",
     "method": "closet",
     "split": "test",
     "table": "main",
