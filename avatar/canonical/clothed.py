@@ -62,7 +62,7 @@ class ClothedConfig:
     smooth: float = 0.015  # metres over which votes for skin and for openings are smoothed
     smallest_skin: float = 0.002  # square metres; smaller islands of skin or cover on the body are overruled
     smallest_part: float = 0.01  # square metres; smaller separate parts of the garment are dropped and reported
-    overlap: float = 0.03  # metres that skin goes on below the garment's edge; the two are not stitched
+    overlap: float = 0.05  # metres that skin goes on below the garment's edge; the two are not stitched
     clearance: float = 0.002  # metres that the garment keeps from the body at rest
     closest: float = 0.4  # share of the scans, those posed nearest to the canonical pose, that give the surface
     mirror: bool = False  # add every scan's mirror image across x, for clothes that are symmetric
@@ -417,7 +417,9 @@ def find_faults(
         faults.append("no garment was found: all that the scans show lies on the body; the template is the body.")
         return faults
     if garment.filled:
-        faults.append(f"{len(garment.filled)} holes of all scans were filled, {sum(garment.filled):.3f} m^2.")
+        faults.append(
+            f"{len(garment.filled)} patches that no scan supports were closed, {sum(garment.filled):.3f} m^2."
+        )
     if garment.dropped:
         faults.append(f"{len(garment.dropped)} small parts were dropped, {sum(garment.dropped):.4f} m^2.")
     if facts["edges_of_three_faces"]:

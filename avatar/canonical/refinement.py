@@ -176,7 +176,7 @@ def refine(
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
     with torch.no_grad():
         vertices, blend = start + fields(moved), (logs + fields(changed)).softmax(dim=1)
     return Refined(Mesh(vertices.numpy(), mesh.faces), blend.numpy(), tuple(losses))
