@@ -64,7 +64,7 @@ class ClothedConfig:
     smallest_part: float = 0.01  # square metres; smaller separate parts of the garment are dropped and reported
     overlap: float = 0.05  # metres that skin goes on below the garment's edge; the two are not stitched
     clearance: float = 0.002  # metres that the garment keeps from the body at rest
-    closest: float = 0.4  # share of the scans, those posed nearest to the canonical pose, that give the surface
+    closest: float = 1.0  # share of the scans, those posed nearest to the canonical pose, that give the surface
     mirror: bool = False  # add every scan's mirror image across x, for clothes that are symmetric
     weights: WeightKind = WeightKind.best
     held_back: float = 0.1  # share of the scans kept for measuring weights and refinement
