@@ -57,7 +57,7 @@ class ClothedConfig:
     """How canonical scans become a clothed template."""
 
     spacing: float = 0.008  # metres between nodes of the fusion's grid
-    level: float = 0.4  # of the mean winding number; a little below a half, so that the surface runs on beyond hems
+    level: float = 0.3  # of the mean winding number; below a half, so that the surface runs on beyond hems
     edge: float = 0.018  # metres, edges of the garment's triangles
     smooth: float = 0.015  # metres over which votes for skin and for openings are smoothed
     smallest_skin: float = 0.002  # square metres; smaller islands of skin or cover on the body are overruled

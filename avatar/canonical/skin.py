@@ -19,6 +19,7 @@ NEAR = 0.015  # metres around a body vertex in which a scan is compared with it
 CANDIDATES = 6  # scan points tried for each vertex
 AGREE = 0.5  # cosine between normals of one and the same surface, at least: 60 degrees
 COVER_AGREE = 0.2  # the same for cloth and the skin far below it
+MAJORITY = 24  # points around a scan's point, itself counted, that decide whether it is garment
 NOISE_FACTOR = 3.0  # standard deviations within which an offset counts as noise
 BARE_PARTS = ("head", "wrist", "hand")  # joints of what is bare on most people
 QUANTILE, QUANTILE_SIGMAS = 0.8, 1.2816  # of absolute offsets, and its place in standard deviations of a normal one
@@ -175,8 +176,8 @@ def without_islands(faces: np.ndarray, labels: np.ndarray, areas: np.ndarray, sm
 def label_points(
     points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, vertex_normals: np.ndarray, vote: SkinVote
 ) -> np.ndarray:
-    """Which points ``(M,)`` of a posed scan are garment: those that do not lie on bare skin within
-    three standard deviations of one scan's noise.
+    """Which points ``(M,)`` of a posed scan are garment: those that do not lie on bare skin within three standard
+    deviations of one scan's noise, by the majority of the points around each.
 
     Args:
         points: ``(M, 3)`` metres.
@@ -191,4 +192,6 @@ def label_points(
     across = np.einsum("mc,mc->m", points - vertices[owner], middle)
     tolerance = NOISE_FACTOR * max(vote.noise, vote.spread)
     near = np.linalg.norm(points - vertices[owner], axis=1) < max(2 * NEAR, 2 * tolerance)
-    return ~(vote.bare[owner] & near & (np.abs(across) <= tolerance))
+    garment = ~(vote.bare[owner] & near & (np.abs(across) <= tolerance))
+    _, ids = build_tree(points).query(points, k=min(MAJORITY, len(points)))
+    return garment[ids.reshape(len(points), -1)].mean(axis=1) > 0.5

@@ -280,7 +280,10 @@ def flip_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         before = np.stack([first, faces[edges.faces[inner, 1]]], axis=1)
         new = np.stack([np.stack([c, a, d], axis=1), np.stack([d, b, c], axis=1)], axis=1)
         old = _face_normals(vertices, before[:, 0]) + _face_normals(vertices, before[:, 1])
-        linked = np.asarray(_neighbours(edges, len(vertices))[c, d]).reshape(-1) > 0
+        keys = edges.ends[:, 0] * len(vertices) + edges.ends[:, 1]
+        linked = np.isin(np.minimum(c, d) * len(vertices) + np.maximum(c, d), keys)
+        if not len(inner):
+            break
         good = ~linked & (c != d) & (np.minimum(valence[a], valence[b]) > 3)
         for side in range(2):
             good &= _upright(old, _face_normals(vertices, new[:, side]))
