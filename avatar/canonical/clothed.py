@@ -60,7 +60,7 @@ class ClothedConfig:
     level: float = 0.3  # of the mean winding number; below a half, so that the surface runs on beyond hems
     edge: float = 0.018  # metres, edges of the garment's triangles
     smooth: float = 0.015  # metres over which votes for skin and for openings are smoothed
-    smallest_skin: float = 0.002  # square metres; smaller islands of skin or cover on the body are overruled
+    smallest_skin: float = 0.01  # square metres; smaller islands of skin or cover on the body are overruled
     smallest_part: float = 0.01  # square metres; smaller separate parts of the garment are dropped and reported
     overlap: float = 0.05  # metres that skin goes on below the garment's edge; the two are not stitched
     clearance: float = 0.002  # metres that the garment keeps from the body at rest

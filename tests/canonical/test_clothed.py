@@ -74,7 +74,9 @@ def test_winding_number_is_one_inside_and_zero_outside():
 
 
 def test_the_surface_of_nested_spheres_is_their_majority():
-    for radii, expected in (((0.2, 0.3, 0.3), 0.3), ((0.2, 0.2, 0.3), 0.2)):
+    """The vote passes a half a quarter into the step of two scans of three, which the blur makes a normal ogive."""
+    inwards = 0.6745 * 0.016
+    for radii, expected in (((0.2, 0.3, 0.3), 0.3 - inwards), ((0.2, 0.2, 0.3), 0.2 + inwards)):
         surface = fused([ball(radius) for radius in radii]).surface(0.5)
         assert np.linalg.norm(surface.vertices, axis=1).mean() == pytest.approx(expected, abs=0.004)
         solid = trimesh.Trimesh(surface.vertices, surface.faces)
