@@ -233,7 +233,7 @@ def test_cover_far_from_the_body_is_seen_through(person):
     scan = dressed_scan(person, 0, ease=0.08)
     offsets = body_offsets(*scan.posed, scan.body, scan.body_normals)
     inner = under_tunic(person) & np.isfinite(offsets)
-    assert inner.sum() > 0.8 * under_tunic(person).sum()
+    assert inner.sum() > 0.7 * under_tunic(person).sum()  # not in armpits and between the legs
     assert np.median(offsets[inner]) == pytest.approx(0.08, abs=0.015)
 
 
