@@ -57,7 +57,9 @@ class ClothedConfig:
     """How canonical scans become a clothed template."""
 
     spacing: float = 0.008  # metres between nodes of the fusion's grid
-    level: float = 0.3  # of the mean winding number; below a half, so that the surface runs on beyond hems
+    level: float = (
+        0.3  # of the scans that have a place inside, and a surface there; refinement takes back too long hems
+    )
     edge: float = 0.018  # metres, edges of the garment's triangles
     smooth: float = 0.015  # metres over which votes for skin and for openings are smoothed
     smallest_skin: float = 0.01  # square metres; smaller islands of skin or cover on the body are overruled
@@ -171,7 +173,8 @@ def fuse_garment(
     fused = fuse_scans(scans, template, vote, config, track)
     surface = fused.surface(config.level)
     support = fused.support(surface.vertices)
-    garment = (support[:, 1] > 0.5).astype(np.float64)
+    supported = support.sum(axis=1) > config.level
+    garment = (supported & (support[:, 1] > support[:, 0])).astype(np.float64)
     share = smooth_votes(surface.vertices, surface.faces, garment, np.ones(len(garment)), config.smooth)
     share, filled = fill_holes(surface, np.nan_to_num(share), support, template)
     part = cut_at_level(surface.vertices, surface.faces, share, 0.5)
