@@ -32,7 +32,7 @@ from avatar.invocation import command_line
 from avatar.io.checkpoints import building, read_weights
 from avatar.io.documents import read_yaml
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Stage, Task
-from avatar.methods.settings import CANONICALIZERS
+from avatar.methods.settings import CANONICALIZERS, Clock
 from avatar.records import Frame, LossTerms, Template
 from avatar.settings import settings_from_dict
 from avatar.values import option
@@ -50,7 +50,8 @@ class CycleConfig:
 
     first_steps: int = 10_000  # optimiser steps with the fields apart
     second_steps: int = 25_000  # and together
-    minutes: float | None = None  # wall-clock budget; training ends at whichever comes first, stages keep their shares
+    minutes: float | None = None  # budget of time; training ends at whichever comes first, stages keep their shares
+    clock: Clock = Clock.wall  # that minutes are read from
     batch: int = 4  # frames a step
     first_lr: float = 0.004
     second_lr: float = 0.001

@@ -11,6 +11,7 @@ from avatar.checks import AvatarError
 from avatar.data.outfits import SPLITS, VALIDATION
 from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, base_method, method_key
+from avatar.evaluation.scores import write_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.export.pictures import load_pyvista
 from avatar.implicit.extraction import ExtractionConfig
@@ -44,6 +45,7 @@ class ExperimentConfig(RunConfig):
     score: ScoreConfig = field(default_factory=ScoreConfig)
     canonicalizer: CanonicalizeConfig = field(default_factory=CanonicalizeConfig)  # of methods that take one
     compare: CompareConfig = field(default_factory=CompareConfig)
+    one_seed: tuple[str, ...] = ()  # variants that are trained with seed 0 alone, where others have several
 
     def __post_init__(self):
         super().__post_init__()
@@ -57,22 +59,31 @@ class ExperimentConfig(RunConfig):
     @property
     def run(self) -> RunConfig:
         """The training run alone, with its full name."""
-        train, share = self.train, f"{self.split.train_fraction:g}"
-        budget = f"{train.minutes:g}min" if train.minutes else f"{train.steps}steps"
         values = {f.name: getattr(self, f.name) for f in fields(RunConfig)}
-        return RunConfig(**values | {"name": f"{self.name}_{budget}_{share}_seed{train.seed}"})
+        name = f"{self.name}_{self.budget}_{self.split.train_fraction:g}_seed{self.train.seed}"
+        return RunConfig(**values | {"name": name})
+
+    @property
+    def budget(self) -> str:
+        """The training's budget as it stands in names: ``1500steps`` or ``12min``."""
+        return f"{self.train.minutes:g}min" if self.train.minutes else f"{self.train.steps}steps"
+
+    @property
+    def is_left_out(self) -> bool:
+        """Whether this is another seed of a variant that has one alone."""
+        return self.train.seed != 0 and self.method.variant in self.one_seed
 
 
 @prepared_process()
 def experiment(config: ExperimentConfig) -> Path:
     """Canonicalizes where the method needs it, trains, predicts and scores; what is finished is not done again.
 
-    Returns:
-        The run's folder.
-
-    Raises:
-        AvatarError: before any work, for what prediction, scores or pictures would refuse after training.
+    Gives the run's folder, which a job that is left out (``one_seed``) does not make. Raises `AvatarError`, before any
+    work, for what prediction, scores or pictures would refuse after training.
     """
+    if config.is_left_out:
+        log.info("%s has seed 0 alone (one_seed): nothing to do.", config.method.variant)
+        return config.run.folder
     is_main = current_world().is_main
     check_job(config)
     for outfit in config.outfit if takes_canonicalizer(config.run) else ():
@@ -133,13 +144,31 @@ def score_run(config: ExperimentConfig, folder: Path) -> None:
 
 
 def tabulate_experiment(configs: Sequence[ExperimentConfig]) -> Path:
-    """The table of an experiment's finished jobs, in the form that its first one asks for."""
+    """The table of an experiment's finished jobs, in the form that its first one asks for; the path of its Markdown.
+
+    Jobs of several budgets have a table each, ``<table>_<budget>``, and the scores of all stand in ``<table>.csv``.
+    """
+    groups: dict[str, list[ExperimentConfig]] = {}
+    for config in configs:
+        if not config.is_left_out:
+            groups.setdefault(config.budget, []).append(config)
+    name = configs[0].compare.table
+    tables = {budget: f"{name}_{budget}" if len(groups) > 1 else name for budget in groups}
+    written = [tabulate_jobs(group, tables[budget]) for budget, group in groups.items()]
+    if len(groups) > 1:
+        every = read_all_scores(path.with_suffix(".csv") for path in written)
+        write_scores(written[0].with_name(f"{name}.csv"), every)
+    return written[0]
+
+
+def tabulate_jobs(configs: Sequence[ExperimentConfig], table: str) -> Path:
+    """One table of finished jobs."""
     first = configs[0]
     runs = tuple(config.run.folder for config in configs)
     takers = [config for config in configs if takes_canonicalizer(config.run)]
     folders = [canonicalizer_of(config, outfit).folder for config in takers for outfit in config.outfit]
     scored = [folder for folder in dict.fromkeys(folders) if (folder / "scores.csv").is_file()]
-    settings = replace(first.compare, runs=runs, runs_root=first.runs_root, canonicalizers=tuple(scored))
+    settings = replace(first.compare, table=table, runs=runs, runs_root=first.runs_root, canonicalizers=tuple(scored))
     if settings.baseline and not has_baseline(settings):
         log.warning("No differences to %s: none of the finished jobs is of it.", settings.baseline)
         settings = replace(settings, baseline="")

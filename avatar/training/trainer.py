@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from contextlib import nullcontext
 from itertools import islice
 from pathlib import Path
@@ -17,6 +16,7 @@ from avatar.checks import AvatarError, DataError
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Task
+from avatar.methods.settings import Clock
 from avatar.nn.layers import synchronize_norms
 from avatar.progress import Progress
 from avatar.records import LossTerms
@@ -35,6 +35,7 @@ class Budget(Protocol):
 
     steps: int
     minutes: float | None
+    clock: Clock
     clip: float | None
     validate_every: int
     save_every: int
@@ -76,14 +77,15 @@ class Trainer:
 
     def run(self, log: TrainingLog | None, stop: StopRequest) -> None:
         """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
-        started, budget = time.monotonic() - self.seconds, self.budget
+        budget = self.budget
+        started = budget.clock.seconds() - self.seconds
         limit = 60 * budget.minutes if budget.minutes else None
         bar = Progress(self.task.label, budget.steps, "step", self.step, limit, self.seconds, silent=log is None)
         with bar, Feed(self.task.inputs_at, budget.steps, self.device) as feed:
             while self.progress() < 1:
                 terms, rate, norm = self.train_step(feed(self.step))
                 self.step += 1
-                stopping = self.sync_clock(time.monotonic() - started, stop)
+                stopping = self.sync_clock(budget.clock.seconds() - started, stop)
                 bar.advance()
                 done, score = self.progress() >= 1, None
                 if self.step % budget.log_every == 0 or done:

@@ -121,6 +121,18 @@ def test_the_table_has_every_form(jobs):
     assert 2 * 600 < sheet.shape[0] < 3 * 600 and 4 * 400 < sheet.shape[1] < 5 * 400  # two poses, three methods, truth
 
 
+def test_budgets_have_a_table_each_and_one_file_of_scores(jobs, tmp_path):
+    longer = replace(jobs[1], train=replace(jobs[1].train, steps=5), compare=replace(jobs[1].compare, out=tmp_path))
+    other = replace(longer, train=replace(longer.train, seed=1), one_seed=("closet",))
+    experiment(longer)
+    assert not experiment(other).exists()
+    shorter = [replace(job, compare=longer.compare) for job in jobs[:2]]
+    assert tabulate_experiment([*shorter, longer, other]) == tmp_path / "small_4steps.md"
+    assert "Equal steps: 5 each." in (tmp_path / "small_5steps.md").read_text()
+    rows = [row for row in read_scores(tmp_path / "small.csv").rows if row.method == "closet"]
+    assert {(row.table, row.steps) for row in rows} == {("small_4steps", 4), ("small_5steps", 5)}
+
+
 def test_scores_of_a_foreign_program_stand_in_the_same_table(jobs, tmp_path, tiny_folder):
     theirs = tmp_path / "theirs"
     shutil.copytree(jobs[1].run.folder / "predictions" / "test" / "tiny", theirs)

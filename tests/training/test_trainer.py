@@ -4,6 +4,7 @@ import errno
 import math
 import os
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from avatar.methods import points
 from avatar.methods.closet import ClosetAvatar
 from avatar.methods.losses import TERMS, LossConfig, point_avatar_loss
 from avatar.methods.points import PointTask
-from avatar.methods.settings import Schedule, TrainConfig
+from avatar.methods.settings import Clock, Schedule, TrainConfig
 from avatar.training.logs import read_log
 from avatar.training.signals import Stopped
 from avatar.training.trainer import Trainer
@@ -168,6 +169,19 @@ def test_clock_ends_training_and_drives_progress(tmp_path):
     assert trainer.progress() == pytest.approx(0.5)  # of 0.6 seconds
     trainer.step = 70_000
     assert trainer.progress() == pytest.approx(0.7)
+
+
+def test_processor_time_does_not_pass_while_others_work(tmp_path):
+    def spent(clock):
+        started = clock.seconds()
+        time.sleep(0.2)
+        return clock.seconds() - started
+
+    assert spent(Clock.processor) < 0.1 < 0.2 <= spent(Clock.wall)
+    trainer = make_trainer(tmp_path, steps=100_000, minutes=0.01, clock=Clock.processor)
+    used = Clock.processor.seconds()
+    fit(trainer)
+    assert 0.6 <= trainer.seconds <= Clock.processor.seconds() - used
 
 
 def test_rates_follow_their_schedule(tmp_path):
