@@ -44,6 +44,16 @@ def ball_loop(centres: np.ndarray, points: np.ndarray, radius: float, k: int) ->
     return groups
 
 
+def spread_ball_loop(centres: np.ndarray, points: np.ndarray, radius: float, k: int) -> list[list[int]]:
+    """Farthest-point samples of the points within a radius, from the nearest on, as `ball_loop` orders them."""
+    groups = []
+    for group in ball_loop(centres, points, radius, len(points)):
+        inside = list(dict.fromkeys(group))
+        kept = sorted(farthest_loop(points[inside], min(k, len(inside)), 0))
+        groups.append([inside[place] for place in kept] + inside[:1] * (k - len(kept)))
+    return groups
+
+
 def barycentric_loop(values: np.ndarray, vertex_ids: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
     """Values ``(V, C)`` blended at each sample: ``(N, C)``."""
     return np.array([sum(w * values[v] for v, w in zip(ids, weights)) for ids, weights in zip(vertex_ids, barycentric)])

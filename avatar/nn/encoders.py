@@ -242,7 +242,7 @@ class PointNeXtLevel(nn.Sequential):
         *inner, width = widths
         down = Neighbourhoods(level.positions, level.finer_positions, level.groups, level.radius)
         reach, count = 2 * level.radius, min(level.groups.shape[1], len(level.groups))
-        groups = ball_query(level.positions, level.positions, reach, count)
+        groups = ball_query(level.positions, level.positions, reach, count, level.spread)
         around = Neighbourhoods(level.positions, level.positions, groups, reach)
         blocks = (InvertedResidual(around, width, wide) for wide in inner)
         super().__init__(SetAbstraction(down, channels, (width,)), *blocks)

@@ -20,6 +20,7 @@ class HierarchyConfig:
     points: tuple[int, ...] = (4096, 2048, 1024, 512, 256, 128)
     radii: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # metres
     neighbours: int = 32  # group size of every ball query
+    spread: bool = True  # groups are spread over their balls; False takes the nearest points, whatever the radius
 
     def __post_init__(self):
         self.points, self.radii = tuple(self.points), tuple(self.radii)
@@ -61,16 +62,16 @@ class Level(nn.Module):
     the three nearest coarse points (PointNet++ eq. 2).
     """
 
-    def __init__(self, finer: Tensor, count: int, radius: float, neighbours: int):
+    def __init__(self, finer: Tensor, count: int, radius: float, neighbours: int, spread: bool = True):
         super().__init__()
-        self.radius = radius
+        self.radius, self.spread = radius, spread
         coarse = finer[farthest_points(finer, count)]
         up_ids = k_nearest(finer[None], coarse[None], min(3, count))[0]
         inverse = 1 / ((finer[:, None] - coarse[up_ids]).square().sum(dim=-1) + 1e-8)
         for name, value in {
             "positions": coarse,
             "finer_positions": finer,
-            "groups": ball_query(coarse, finer, radius, neighbours),
+            "groups": ball_query(coarse, finer, radius, neighbours, spread),
             "up_ids": up_ids,
             "up_weights": inverse / inverse.sum(dim=1, keepdim=True),
         }.items():
@@ -90,6 +91,6 @@ def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:
         raise AvatarError(f"points: expected {expected}, got {config.points[0]}.")
     levels, finer = nn.ModuleList(), positions.detach()
     for count, radius in zip(config.points, config.radii):
-        levels.append(Level(finer, count, radius, config.neighbours))
+        levels.append(Level(finer, count, radius, config.neighbours, config.spread))
         finer = levels[-1].positions
     return levels
