@@ -44,13 +44,14 @@ def ball_loop(centres: np.ndarray, points: np.ndarray, radius: float, k: int) ->
     return groups
 
 
-def spread_ball_loop(centres: np.ndarray, points: np.ndarray, radius: float, k: int) -> list[list[int]]:
-    """Farthest-point samples of the points within a radius, from the nearest on, as `ball_loop` orders them."""
+def ranked_ball_loop(
+    centres: np.ndarray, points: np.ndarray, radius: float, k: int, ranks: list[int]
+) -> list[list[int]]:
+    """The nearest point, then the k - 1 of lowest rank within a radius; short lists repeat the nearest."""
     groups = []
-    for group in ball_loop(centres, points, radius, len(points)):
-        inside = list(dict.fromkeys(group))
-        kept = sorted(farthest_loop(points[inside], min(k, len(inside)), 0))
-        groups.append([inside[place] for place in kept] + inside[:1] * (k - len(kept)))
+    for nearest, *others in ball_loop(centres, points, radius, len(points)):
+        group = [nearest, *sorted(set(others) - {nearest}, key=lambda i: ranks[i])][:k]
+        groups.append(group + [nearest] * (k - len(group)))
     return groups
 
 

@@ -171,37 +171,27 @@ def _k_nearest_chunked(queries: Tensor, points: Tensor, k: int) -> Tensor:
     return torch.cat(found)
 
 
-def ball_query(centres: Tensor, points: Tensor, radius: float, k: int, spread: bool = True) -> Tensor:
-    """Up to k points within a radius of each centre, nearest first; short lists repeat their nearest point.
+def ball_query(centres: Tensor, points: Tensor, radius: float, k: int, ranks: Tensor | None = None) -> Tensor:
+    """Up to k points within a radius of each centre, its nearest first; short lists repeat their nearest point.
 
-    ``spread`` groups are farthest-point samples of their ball, from its centre on; others the k nearest points, however
-    far the ball reaches. For a constant template, called once (CloSET 4, network architecture). ``(S, 3)`` and
-    ``(N, 3)``, metres, to ``(S, k)`` int64. A centre with no point in reach gets its nearest point k times.
+    Of a ball that holds more, the nearest to its centre or, with ``ranks (N,)``, those of lowest rank beside the very
+    nearest: ranks in the order of farthest-point sampling spread them over the ball, whatever the density of points.
+    For a constant template, called once (CloSET 4, network architecture). ``(S, 3)`` and ``(N, 3)``, metres, to
+    ``(S, k)`` int64. A centre with no point in reach gets its nearest point k times.
     """
     check_shape("centres", centres, "S 3")
     check_shape("points", points, "N 3")
-    if spread:
+    reach = min(k, len(points))
+    if ranks is not None:
         tree = build_tree(points.double().cpu().numpy())
         held = tree.query_ball_point(centres.double().cpu().numpy(), radius, return_length=True)
         reach = min(max(k, int(held.max())), len(points))
-    else:
-        reach = min(k, len(points))
     ids = k_nearest(centres[None], points[None], reach)[0]
     distances = (points[ids] - centres[:, None]).norm(dim=-1)
+    if ranks is not None:
+        keys = torch.where(distances <= radius, ranks[ids], torch.iinfo(torch.int64).max)
+        keys[:, 0] = -1
+        kept = keys.argsort(dim=1)[:, :k]
+        ids, distances = ids.gather(1, kept), distances.gather(1, kept)
     ids = torch.where(distances <= radius, ids, ids[:, :1])
-    if reach > k:
-        kept = spread_places(points[ids], k).sort(dim=1).values
-        ids = ids.gather(1, kept)
     return torch.cat([ids, ids[:, :1].expand(-1, k - ids.shape[1])], dim=1)
-
-
-def spread_places(groups: Tensor, k: int) -> Tensor:
-    """Farthest-point samples of each group from its first point on: ``(S, M, 3)`` to ``(S, k)`` places in the group."""
-    chosen = torch.zeros(len(groups), dtype=torch.int64, device=groups.device)
-    gaps = torch.full(groups.shape[:2], torch.inf, device=groups.device)
-    rows, places = torch.arange(len(groups), device=groups.device), []
-    for _ in range(k):
-        places.append(chosen)
-        gaps = torch.minimum(gaps, (groups - groups[rows, chosen][:, None]).square().sum(dim=-1))
-        chosen = gaps.argmax(dim=1)
-    return torch.stack(places, dim=1)

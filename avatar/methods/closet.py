@@ -52,7 +52,7 @@ class PoseLocality(Enum):
 class ClosetConfig:
     """CloSET's switches and sizes; the defaults are the paper's method at full size."""
 
-    pose_encoder: PointNet2Config = field(default_factory=PointNet2Config)
+    pose_encoder: PointNet2Config = field(default_factory=lambda: PointNet2Config(relative=True))
     garment_encoder: PointNet2Config = field(default_factory=lambda: PointNet2Config(**FULL_GARMENT_ENCODER))
     garment_decoder: DecoderConfig = field(default_factory=DecoderConfig)
     pose_decoder: DecoderConfig = field(default_factory=DecoderConfig)
@@ -62,6 +62,7 @@ class ClosetConfig:
     template: bool = True  # explicit template decomposition (CloSET 3.2); False is the CSF ablation
     pose: bool = True  # the pose branch; False is the `static` floor: a garment template skinned by the body
     pose_noise: float = 0.0  # metres; noise on the pose encoder's input in training
+    rest_vertices: bool = True  # the pose encoder sees the template's vertices as features beside the posed ones
     pose_locality: PoseLocality = PoseLocality.whole
     local_encoder: LocalPoseConfig = field(default_factory=LocalPoseConfig)  # instead of pose_encoder when kinematic
     skinning: Skinning = Skinning.body
@@ -103,7 +104,7 @@ class ClosetAvatar(TemplateNetwork):
             if config.pose_locality is PoseLocality.kinematic:
                 self.pose_encoder = LocalPoseEncoder(template, config.local_encoder)
             else:
-                self.pose_encoder = encoder(template, 3, config.pose_encoder)
+                self.pose_encoder = encoder(template, 6 if config.rest_vertices else 3, config.pose_encoder)
             self.pose_decoder = ShapeDecoder(channels + self.pose_encoder.out_channels, config.pose_decoder)
 
     def skin_with(self, skinning: LearnedSkinning) -> None:
@@ -129,6 +130,8 @@ class ClosetAvatar(TemplateNetwork):
         pose_vertices = batch.pose_vertices
         if self.training and self.config.pose_noise:
             pose_vertices = pose_vertices + torch.randn_like(pose_vertices) * self.config.pose_noise
+        if self.config.rest_vertices:
+            pose_vertices = torch.cat([pose_vertices, self.vertices.expand_as(pose_vertices)], dim=-1)
         return interpolate(self.pose_encoder(pose_vertices), samples)
 
     def pose_points(self, local: Decoded, batch: Batch, samples: SurfaceSamples) -> Prediction:

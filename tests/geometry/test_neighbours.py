@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import ball_loop, nearest_loop, spread_ball_loop
+from reference import ball_loop, nearest_loop, ranked_ball_loop
 
 from avatar.checks import AvatarError
 from avatar.geometry import neighbours
@@ -20,6 +20,7 @@ from avatar.geometry.neighbours import (
     k_nearest,
     nearest,
 )
+from avatar.geometry.surface import farthest_points
 from avatar.geometry.trees import build_tree
 
 
@@ -119,28 +120,27 @@ def test_counts_and_shapes_are_checked():
 @pytest.mark.parametrize("radius", [0.05, 0.3, 5.0])
 def test_ball_query_agrees_with_loop(radius):
     centres, points = cloud(1, 12, 0)[0], cloud(1, 60, 1)[0]
-    found = ball_query(centres, points, radius, 8, spread=False)
+    found = ball_query(centres, points, radius, 8)
     assert found.tolist() == ball_loop(centres.double().numpy(), points.double().numpy(), radius, 8)
 
 
 @pytest.mark.parametrize("radius", [0.05, 0.3, 1.0, 5.0])
-def test_spread_groups_are_farthest_points_of_their_balls(radius):
+def test_ranked_ball_query_agrees_with_loop(radius):
     centres, points = cloud(1, 12, 0)[0], cloud(1, 60, 1)[0]
-    found = ball_query(centres, points, radius, 8)
-    slow = spread_ball_loop(centres.double().numpy(), points.double().numpy(), radius, 8)
-    assert list(map(sorted, found.tolist())) == list(map(sorted, slow))
-    assert (found[:, 0] == nearest(centres[None], points[None])[0]).all()
+    ranks = torch.randperm(60, generator=torch.Generator().manual_seed(2))
+    found = ball_query(centres, points, radius, 8, ranks)
+    slow = ranked_ball_loop(centres.double().numpy(), points.double().numpy(), radius, 8, ranks.tolist())
+    assert found.tolist() == slow
 
 
-def test_groups_reach_as_far_as_their_balls_not_as_far_as_their_number():
-    """12 of 12,000 points on a square metre: the nearest lie within 2 cm, a ball of 15 cm holds them all alike."""
-    points = torch.rand(12_000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
+def test_ranked_groups_reach_as_far_as_their_balls_not_as_far_as_their_number():
+    """12 of 6,000 points on a square metre: the nearest lie within 3 cm, a ball of 15 cm holds hundreds."""
+    points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
     centres = torch.tensor([[0.5, 0.5, 0.0], [0.3, 0.6, 0.0]])
-    reach = {
-        spread: (points[ball_query(centres, points, 0.15, 12, spread)] - centres[:, None]).norm(dim=-1).amax(dim=1)
-        for spread in (True, False)
-    }
-    assert (reach[True] > 0.14).all() and (reach[False] < 0.03).all()
+    ranks = farthest_points(points, len(points)).argsort()
+    for order, least, most in ((ranks, 0.1, 0.15), (None, 0.0, 0.03)):
+        reach = (points[ball_query(centres, points, 0.15, 12, order)] - centres[:, None]).norm(dim=-1).amax(dim=1)
+        assert (least < reach).all() and (reach <= most).all()
 
 
 def test_ball_query_groups_longer_than_the_cloud_repeat_the_nearest():
