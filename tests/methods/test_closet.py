@@ -77,17 +77,19 @@ def test_template_is_one_for_all_poses_and_differs_by_outfit():
     torch.testing.assert_close(template.points[0], resting + prediction.garment_offsets[0])
 
 
-def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
+@pytest.mark.parametrize("rest_vertices", [True, False])
+def test_each_frame_is_decoded_from_its_own_outfit_and_pose(rest_vertices):
     """CloSET eq. 3, frame by frame; outfits that are neither all there nor in their order, and codes that matter."""
     torch.manual_seed(0)
-    model = ClosetAvatar(TEMPLATE, 3, small_config(code_std=1.0)).eval()
+    model = ClosetAvatar(TEMPLATE, 3, small_config(code_std=1.0, rest_vertices=rest_vertices)).eval()
     batch, samples = replace(random_batch(), outfit_ids=torch.tensor([2, 1, 2])), template_points()
     prediction = model(batch, samples)
     scale, skin = model.config.offset_scale, vertex_normals(TEMPLATE.vertices, TEMPLATE.faces)
     for frame, outfit in enumerate(batch.outfit_ids):
         garment = model.garment_features(model.codes[None, outfit], samples)
         places = interpolate(TEMPLATE.vertices, samples)
-        pose = interpolate(model.pose_encoder(batch.pose_vertices[None, frame]), samples)
+        seen = [batch.pose_vertices[None, frame], *([TEMPLATE.vertices[None]] if rest_vertices else [])]
+        pose = interpolate(model.pose_encoder(torch.cat(seen, dim=-1)), samples)
         template = model.garment_decoder(garment, places)
         wrinkles = model.pose_decoder(torch.cat([pose, garment], dim=-1), places)
         expected = {
