@@ -32,6 +32,7 @@ FULL_GARMENT_ENCODER = {
     "abstraction": ((32, 32, 32), (32, 32, 64), (64, 64, 64), (64, 64, 128), (128, 128, 128), (128, 128, 128)),
     "propagation": ((128, 128), (128, 64), (64, 64), (64, 64), (64, 64), (64, 64)),
 }
+FREE_RATE = 4.0  # units of a decoder's output that one of a free offset stands for, beside codes learned at one rate
 
 
 class Skinning(Enum):
@@ -58,6 +59,8 @@ class ClosetConfig:
     pose_decoder: DecoderConfig = field(default_factory=DecoderConfig)
     code_channels: int = 64  # width of the learned garment code on each template vertex
     code_std: float = 0.01  # standard deviation of a fresh garment code
+    code_skip: bool = False  # the decoders see the garment code itself beside its features (ours)
+    free_offsets: bool = False  # an offset of each vertex, learned beside the code, is added to the template's (ours)
     offset_scale: float = 0.02  # metres one unit of a decoder's output stands for (POP)
     template: bool = True  # explicit template decomposition (CloSET 3.2); False is the CSF ablation
     pose: bool = True  # the pose branch; False is the `static` floor: a garment template skinned by the body
@@ -73,6 +76,8 @@ class ClosetConfig:
     def __post_init__(self):
         if not (self.template or self.pose):
             raise AvatarError("template, pose: expected at least one branch, got neither.")
+        if self.free_offsets and not self.template:
+            raise AvatarError("free_offsets: they are part of the explicit template; set template=true.")
         if self.pose_noise and self.pose_locality is PoseLocality.kinematic:
             raise AvatarError("pose_noise: it is for the global pose encoder; set it to 0 with kinematic locality.")
         if self.train_field and self.skinning is Skinning.body:
@@ -94,10 +99,12 @@ class ClosetAvatar(TemplateNetwork):
         super().__init__(template, config)
         self.skinning: LearnedSkinning | None = None
         codes = torch.randn(outfits, len(template.vertices), config.code_channels) * config.code_std
+        if config.free_offsets:
+            codes = torch.cat([codes, torch.zeros_like(codes[..., :3])], dim=-1)
         self.codes = nn.Parameter(codes)
         encoder = ENCODERS[config.encoder]
         self.garment_encoder = encoder(template, config.code_channels, config.garment_encoder)
-        channels = self.garment_encoder.out_channels + 3
+        channels = self.garment_encoder.out_channels + 3 + (config.code_channels if config.code_skip else 0)
         if config.template:
             self.garment_decoder = ShapeDecoder(channels, config.garment_decoder)
         if config.pose:
@@ -121,7 +128,17 @@ class ClosetAvatar(TemplateNetwork):
 
     def garment_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
         """Garment features of each sample: ``(O, V, C)`` codes to ``(O, N, C')``."""
-        return interpolate(self.garment_encoder(codes), samples)
+        codes = codes[..., : self.config.code_channels]
+        features = self.garment_encoder(codes)
+        return interpolate(torch.cat([features, codes], dim=-1) if self.config.code_skip else features, samples)
+
+    def decode_garment(self, codes: Tensor, garment: Tensor, samples: SurfaceSamples) -> Decoded:
+        """As `TemplateNetwork.decode_garment`, with the free offsets added where there are some."""
+        decoded = super().decode_garment(codes, garment, samples)
+        if not self.config.free_offsets:
+            return decoded
+        free = interpolate(codes[..., self.config.code_channels :], samples) * FREE_RATE
+        return Decoded(decoded.offsets + free, decoded.normals)
 
     def pose_features(self, batch: Batch, samples: SurfaceSamples) -> Tensor:
         """Features ``(B, N, C)`` of each sample, of its frame's whole pose or of the joints near it."""
