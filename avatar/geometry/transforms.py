@@ -1,4 +1,4 @@
-"""Rigid and affine transforms as (..., 4, 4) matrices, named destination_from_source.
+"""Rigid and affine transforms as (..., 4, 4) matrices, named destination_from_source; Fourier features of points.
 
 RoMa is imported where it is used: it loads torch's compiler, which takes as long as torch itself.
 """
@@ -93,3 +93,12 @@ def rotation_between(source: Tensor, target: Tensor) -> Tensor:
     if axis.norm() < 1e-8:  # (anti)parallel: the cross product no longer tells the axis
         axis = torch.linalg.cross(source, torch.eye(3, dtype=source.dtype, device=source.device)[source.abs().argmin()])
     return rotation_from_axis_angle(axis / axis.norm() * angle).to(dtype)
+
+
+def fourier_features(points: Tensor, orders: int, base: float = 1.0) -> Tensor:
+    """Points ``(..., 3)``, then sin and cos of ``base`` 2^k of them for k below ``orders``, to ``(..., 3 + 6 orders)``.
+
+    The base is pi in NeRF and 1 in SCANimate.
+    """
+    waves = [wave(base * 2**order * points) for order in range(orders) for wave in (torch.sin, torch.cos)]
+    return torch.cat([points, *waves], dim=-1)

@@ -13,12 +13,17 @@ import torch
 from torch import Tensor, nn
 
 from avatar.body.packed import read_template
-from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
-from avatar.canonical.fields import SkinningField, bounding_box
-from avatar.canonical.losses import TERMS, CanonicalLossConfig, NearestWeights, canonicalization_loss
-from avatar.canonical.posed import DrawConfig, PosedScan, ScanBatch, draw_batch, prepare_scan, to_root_frame
-from avatar.canonical.scans import STRETCH
-from avatar.checks import AvatarError, DataError, check_name
+from avatar.canonical.canonicalizer import (
+    TERMS,
+    Canonicalizer,
+    CanonicalizerConfig,
+    CanonicalLossConfig,
+    Latent,
+    canonicalization_loss,
+)
+from avatar.canonical.fields import BodyField, SkinningField, bounding_box
+from avatar.canonical.scans import STRETCH, DrawConfig, PosedScan, ScanBatch, draw_batch, prepare_scan, to_root_frame
+from avatar.checks import DataError, check_name, check_range
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.canonical_frames import CanonicalOutfit
 from avatar.data.layouts import find_outfit
@@ -27,13 +32,12 @@ from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
-from avatar.implicit.fields import BodyField
 from avatar.invocation import command_line
 from avatar.io.checkpoints import building, read_weights
 from avatar.io.documents import read_yaml
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Stage, Task
 from avatar.methods.settings import CANONICALIZERS
-from avatar.records import Frame, LossTerms, Template
+from avatar.records import Frame, LossTerms, Template, map_tensors
 from avatar.settings import settings_from_dict
 from avatar.values import option
 
@@ -65,16 +69,10 @@ class CycleConfig:
     seed: int = 0
 
     def __post_init__(self):
-        for name in ("first_steps", "batch", "code_steps", "save_every", "log_every"):
-            if getattr(self, name) < 1:
-                raise AvatarError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        if self.second_steps < 0 or (self.clip is not None and self.clip <= 0):
-            problem = f"second_steps: expected at least 0, clip: above 0; got {self.second_steps}, {self.clip}."
-            raise AvatarError(problem)
-        if self.minutes is not None and self.minutes <= 0:
-            raise AvatarError(f"minutes: expected above 0 or null, got {self.minutes}.")
-        if min(self.first_lr, self.second_lr, self.code_lr) <= 0 or not 0 < self.decay <= 1:
-            raise AvatarError("first_lr, second_lr, code_lr: expected above 0, decay: in (0, 1].")
+        check_range(self, "first_steps", "batch", "code_steps", "save_every", "log_every", low=1)
+        check_range(self, "second_steps", low=0)
+        check_range(self, "minutes", "first_lr", "second_lr", "clip", "code_lr", above=0)
+        check_range(self, "decay", above=0, high=1)
 
     @property
     def validate_every(self) -> int:
@@ -97,26 +95,17 @@ class CanonicalizerTask(Task):
     terms = TERMS
     label = "canonicalizer"
 
-    def __init__(
-        self,
-        model: Canonicalizer,
-        template: Template,
-        scans: Sequence[PosedScan],
-        names: Sequence[str],
-        config: CycleConfig,
-    ):
-        """Prepares training of a canonicalizer on its scans; ``names`` are theirs, for messages."""
+    def __init__(self, model: Canonicalizer, template: Template, scans: Sequence, names: Sequence, config: CycleConfig):
+        """Prepares training of a canonicalizer on its `PosedScan`s; ``names`` are theirs, for messages."""
         self.model, self.config, self.scans, self.names = model, config, scans, names
-        self.nearest = NearestWeights(template, next(model.parameters()).device)
-        self.weights = template.weights
-        self.frames, self.batch = len(scans), config.batch
+        self.nearest = BodyField(template, 1).to(next(model.parameters()).device)
+        self.weights, self.frames, self.batch = template.weights, len(scans), config.batch
         self.groups = (list(model.parameters()),)
         plan = ((config.first_steps, config.first_lr), (config.second_steps, config.second_lr))
         self.stages = tuple(Stage(steps / config.steps, (rate,), config.rate_factor) for steps, rate in plan if steps)
 
     def inputs_at(self, step: int) -> tuple[ScanBatch]:
-        places = torch.arange(step * self.config.batch, (step + 1) * self.config.batch)
-        frames = [self.frame_at(int(place)) for place in places]
+        frames = [self.frame_at(place) for place in range(step * self.batch, (step + 1) * self.batch)]
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + step)
         return (draw_batch(self.scans, frames, self.weights, self.config.draw, generator),)
 
@@ -148,12 +137,13 @@ def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start:
     if model.config.latent is Latent.pose:
         return scan.pose.to(start)
     code = start.detach().clone().requires_grad_()
-    nearest, weights = NearestWeights(template, code.device), template.weights.cpu()
+    nearest = BodyField(template, 1).to(code.device)
     optimiser = torch.optim.Adam([code], lr=config.code_lr)
     for step in range(config.code_steps):
         optimiser.param_groups[0]["lr"] = config.code_lr * config.rate_factor(step, step / config.code_steps)
         generator = torch.Generator().manual_seed(config.seed * SEED_STRIDE + step)
-        batch = draw_batch([scan], [0], weights, config.draw, generator).to(code.device)
+        batch = draw_batch([scan], [0], template.weights.cpu(), config.draw, generator)
+        batch = map_tensors(batch, lambda tensor: tensor.to(code.device))
         cycle = model(batch, code[None], together=True)
         loss = canonicalization_loss(cycle, batch, nearest, config.loss, step / config.code_steps).total
         (code.grad,) = torch.autograd.grad(loss, [code])
@@ -191,10 +181,8 @@ class CanonicalizeConfig:
     def __post_init__(self):
         for what in ("name", "dataset", "outfit"):
             check_name(what, getattr(self, what))
-        if self.stretch <= 1:
-            raise AvatarError(f"stretch: expected above 1, got {self.stretch}.")
-        if min(self.pictures, self.scored) < 0:
-            raise AvatarError(f"pictures, scored: expected at least 0, got {self.pictures} and {self.scored}.")
+        check_range(self, "stretch", above=1)
+        check_range(self, "pictures", "scored", low=0)
 
     @property
     def folder(self) -> Path:
@@ -246,13 +234,16 @@ class TrainedCanonicalizer:
         return fit_latent(self.model, self.template, scan, codes[alike], self.config.train)
 
     def weights_of(self, points: np.ndarray, frame: Frame) -> np.ndarray:
-        """Weights ``(M, J)`` of posed points ``(M, 3)`` in the frame's world, metres (see `SkinningSource`)."""
+        """Weights ``(M, J)`` of posed points ``(M, 3)`` in the frame's world, metres."""
         code = self.code_of(frame)[None]
         box = bounding_box(to_root_frame(frame.body.vertices, frame.body))[None].to(code.device)
         places = to_root_frame(points, frame.body).to(code.device)
         with torch.no_grad():
             parts = in_chunks(lambda chunk: self.model.inverse(places[chunk][None], code, box)[0], len(places), CHUNK)
         return torch.cat(parts).cpu().numpy()
+
+
+SkinningSource = TrainedCanonicalizer | BodyField  # what gives posed points their weights, by `weights_of`
 
 
 def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicalizer:

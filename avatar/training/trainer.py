@@ -1,27 +1,30 @@
-"""The trainer of every method: stages, budget, bad steps, log, validation, checkpoints, stop signals and ranks."""
+"""The trainer of every method: stages, budget, bad steps, inputs, log, validation, checkpoints, signals, ranks."""
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 import math
 import time
-from contextlib import nullcontext
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor, nn
 
-from avatar.checks import AvatarError, DataError
+from avatar.checks import AvatarError, DataError, require
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
+from avatar.io.npz import write_whole
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Task
 from avatar.nn.layers import synchronize_norms
 from avatar.progress import Progress
-from avatar.records import LossTerms
-from avatar.training.feeding import Feed, to_device
-from avatar.training.logs import TrainingLog
+from avatar.records import LossTerms, map_tensors
 from avatar.training.signals import StopRequest, stop_requests
 from avatar.world import average, broadcast, current_world, gather, gradients_of
 
@@ -248,3 +251,108 @@ def spent(budget: Budget, steps: int, seconds: float) -> float:
     """Share of a budget that steps and seconds of training have used, by whichever is further."""
     clock = seconds / (60 * budget.minutes) if budget.minutes else 0.0
     return max(steps / budget.steps, clock)
+
+
+class Feed:
+    """The inputs of training steps on a device: while a step trains there, a thread prepares those of the next one.
+
+    They are the same as without it, for they follow from the step alone. Used as a ``with`` block, at whose end nothing
+    goes on in the background. For CUDA they are copied from pinned memory, beside the work of the step before. On the
+    CPU they are prepared on request: a thread with work of its own would have OpenMP threads of its own, and OpenMP
+    then lets all of them sleep at once (docs/performance.md).
+    """
+
+    def __init__(self, make: Callable[[int], Inputs], steps: int, device: torch.device):
+        """Prepares nothing yet; ``make`` gives the inputs of a step, by one call at a time, at most one step ahead."""
+        self.make, self.steps, self.device = make, steps, device
+        self.pinned = device.type == "cuda"
+        options = {"initializer": torch.cuda.set_device, "initargs": (device,)} if self.pinned else {}
+        self.thread = ThreadPoolExecutor(1, "feed", **options) if device.type != "cpu" else None
+        self.ahead: dict[int, Future[Inputs]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.thread:
+            self.thread.shutdown(cancel_futures=True)
+
+    def __call__(self, step: int) -> Inputs:
+        """The inputs of a step, on the device. What `make` raises for a step is raised here, at that step."""
+        if not self.thread:
+            return to_device(self.make(step), self.device)
+        ready = self.ahead.pop(step, None) or self.thread.submit(self._prepare, step)
+        records = ready.result()
+        self.ahead = {step + 1: self.thread.submit(self._prepare, step + 1)} if step + 1 < self.steps else {}
+        return to_device(records, self.device)
+
+    def _prepare(self, step: int) -> Inputs:
+        records = self.make(step)
+        return tuple(map_tensors(record, Tensor.pin_memory) for record in records) if self.pinned else records
+
+
+def to_device(records: Inputs, device: torch.device) -> Inputs:
+    """Inputs with their tensors on a device; from pinned memory without waiting for the copy."""
+    return tuple(map_tensors(record, lambda tensor: tensor.to(device, non_blocking=True)) for record in records)
+
+
+class TrainingLog:
+    """Appends rows to ``metrics.csv``; a resumed run goes on in its file.
+
+    Rows hold ``split`` (train or validation), ``step``, ``epoch``, ``seconds`` and one column for every term.
+    """
+
+    def __init__(self, folder: Path, columns: list[str], from_step: int):
+        """Opens the log of a run and drops rows past the step a resumed run starts from.
+
+        Raises `DataError` when the log cannot be written; the one there is stays as it is.
+        """
+        self.path = folder / "metrics.csv"
+        self.columns = ["split", "step", "epoch", "seconds", *columns]
+        kept = [row for row in read_log(self.path) if int(row["step"]) <= from_step] if self.path.is_file() else []
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self.columns, restval="", extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(kept)
+        write_whole(self.path, text.getvalue().encode())
+        try:
+            self.file = self.path.open("a", newline="")
+        except OSError as error:
+            raise self._not_written(error) from error
+        self.writer = csv.DictWriter(self.file, self.columns, restval="", extrasaction="ignore")
+        self.board = None
+        with suppress(AvatarError):
+            require("tensorboard")
+            self.board = require("torch.utils.tensorboard").SummaryWriter(folder / "tensorboard")
+
+    def _not_written(self, error: OSError) -> DataError:
+        hint = "Make room and give the same command again."
+        return DataError(self.path, f"could not be written ({error.strerror}).", hint)
+
+    def write(self, split: str, step: int, epoch: int, seconds: float, values: dict[str, float]) -> None:
+        """Writes one row and flushes it. Raises `DataError` when the disk refuses."""
+        row = {"split": split, "step": step, "epoch": epoch, "seconds": f"{seconds:.2f}"}
+        try:
+            self.writer.writerow(row | {name: f"{value:.6g}" for name, value in values.items()})
+            self.file.flush()
+        except OSError as error:
+            raise self._not_written(error) from error
+        if self.board:
+            for name, value in values.items():
+                self.board.add_scalar(f"{split}/{name}", value, step)
+
+    def close(self) -> None:
+        """Closes the file and the board."""
+        try:
+            self.file.close()
+        except OSError as error:
+            raise self._not_written(error) from error
+        if self.board:
+            self.board.close()
+
+
+def read_log(path: Path) -> list[dict[str, str]]:
+    """The whole rows of a training log; what a killed run left half-written is passed over."""
+    text = path.read_text(errors="replace")
+    rows = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+    return [row for row in rows if str(row.get("step")).isdigit() and None not in (*row, *row.values())]

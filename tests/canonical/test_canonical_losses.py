@@ -6,10 +6,16 @@ import pytest
 import torch
 from limbs import arm_frame, arm_template
 
-from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Cycle
-from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.losses import TERMS, CanonicalLossConfig, NearestWeights, canonicalization_loss
-from avatar.canonical.posed import DrawConfig, draw_batch, prepare_scan
+from avatar.canonical.canonicalizer import (
+    TERMS,
+    Canonicalizer,
+    CanonicalizerConfig,
+    CanonicalLossConfig,
+    Cycle,
+    canonicalization_loss,
+)
+from avatar.canonical.fields import BodyField, SkinningFieldConfig
+from avatar.canonical.scans import DrawConfig, draw_batch, prepare_scan
 from avatar.checks import AvatarError
 
 TEMPLATE = arm_template()
@@ -17,7 +23,7 @@ SILENT = dict.fromkeys(TERMS, 0.0)
 SMALL = CanonicalizerConfig(SkinningFieldConfig(width=16), SkinningFieldConfig(width=16, orders=8, latent=4))
 
 SCANS = [prepare_scan(arm_frame(bend), TEMPLATE, 500) for bend in (0.2, 1.3)]
-NEAREST = NearestWeights(TEMPLATE)
+NEAREST = BodyField(TEMPLATE, 1)
 
 
 def batch_of(frames=(0, 1)):

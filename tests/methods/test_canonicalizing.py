@@ -12,10 +12,9 @@ from limbs import arm_frame, arm_template, legs_template, skirt_frame
 import avatar.methods.canonicalizer as cycles
 from avatar.body.packed import read_template
 from avatar.body.skinning import skin_transforms
-from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
+from avatar.canonical.canonicalizer import TERMS, Canonicalizer, CanonicalizerConfig, Latent, canonicalization_loss
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.losses import TERMS, canonicalization_loss
-from avatar.canonical.posed import DrawConfig, prepare_scan, to_root_frame
+from avatar.canonical.scans import DrawConfig, prepare_scan, to_root_frame
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset
 from avatar.data.scanner import ScanConfig
@@ -36,8 +35,7 @@ from avatar.methods.canonicalizer import (
 )
 from avatar.pipeline.canonicalization import canonicalize, canonicalizer_with, score_canonical_scans, weight_colors
 from avatar.runs.canonicalizing import canonicalize_frames, skinning_source, train_canonicalizer
-from avatar.training.logs import read_log
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import Trainer, read_log
 
 TEMPLATE = arm_template()
 NETS = CanonicalizerConfig(SkinningFieldConfig(width=32, orders=4), SkinningFieldConfig(width=32, orders=4, latent=4))
