@@ -14,8 +14,7 @@ Result = TypeVar("Result")
 
 def widen(value: Any) -> Any:
     """A tensor of half precision in float32; anything else as it is."""
-    half = isinstance(value, Tensor) and value.dtype in (torch.bfloat16, torch.float16)
-    return value.float() if half else value
+    return value.float() if getattr(value, "dtype", None) in (torch.bfloat16, torch.float16) else value
 
 
 def full_precision(function: Callable[..., Result]) -> Callable[..., Result]:

