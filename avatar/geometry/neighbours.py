@@ -28,13 +28,10 @@ def nearest(queries: Tensor, points: Tensor) -> Tensor:
 def k_nearest(queries: Tensor, points: Tensor, k: int, trees: Sequence[Tree] = ()) -> Tensor:
     """Indices of k nearest points to each query, nearest first: ``(B, N, 3)``, ``(B, M, 3)`` to ``(B, N, k)`` int64.
 
-    Exact on every device: distances are sums of squared differences, never the expanded product form, which
-    picks a wrong neighbour for near ties. Among points at the same distance any may come, the same each time.
-    ``trees`` are those of the points on the CPU, where the caller has built them already.
-
-    Coordinates that are not finite are refused on the CPU. On a device looking for them would stall the stream, so
-    they pass through: the indices stay in range and the distances taken with them are NaN, for the loss to show.
-    Raises `AvatarError` on wrong shapes, non-finite coordinates (CPU), k below 1 or fewer than k points.
+    Exact on every device: distances are sums of squared differences, never the expanded product form. Among points at
+    the same distance any may come, the same each time. ``trees`` are those of the points on the CPU, where they are
+    built already. Raises `AvatarError` on wrong shapes, k below 1, fewer than k points or, on the CPU, coordinates that
+    are not finite; on a device, where a check would stall the stream, their indices stay in range.
     """
     dims = check_shape("points", points, "B M 3", B=check_shape("queries", queries, "B N 3")["B"])
     if not 1 <= k <= dims["M"]:
@@ -61,9 +58,8 @@ class Correspondences:
 def correspond(points: Tensor, scan: Tensor) -> Correspondences:
     """What `nearest` gives for points ``(B, N, 3)`` in a scan ``(B, M, 3)`` and the other way, faster on the CPU.
 
-    A tree keeps its points in an order in which neighbours follow each other; queried in that order, the other tree's
-    branches stay in the processor's cache. Trees are built side by side, each cloud by one thread. Among points at the
-    same distance another may come than from `nearest`. Raises `AvatarError` as `k_nearest`.
+    Points are queried in the order of their own tree, so the other tree's branches stay in the processor's cache. Among
+    points at the same distance another may come than from `nearest`. Raises `AvatarError` as `k_nearest`.
     """
     dims = check_shape("points", points, "B N 3")
     check_shape("scan", scan, "B M 3", B=dims["B"])
@@ -96,8 +92,7 @@ class FixedPoints:
 def try_fused(queries: Tensor, points: Tensor) -> Tensor | None:
     """`kernels.nearest_fused`; None, with one warning for each kind of error, where Triton is missing or fails.
 
-    CUDA builds of torch include Triton, but it needs a C compiler, too. What fails once, such as for want of memory, is
-    tried again at the next call.
+    It needs a C compiler, too. What fails once, such as for want of memory, is tried again at the next call.
     """
     try:
         from avatar.geometry.kernels import nearest_fused

@@ -39,11 +39,10 @@ def check_atlas(uv: Tensor, uv_faces: Tensor, faces: int) -> None:
 def rasterise_uv(uv: Tensor, uv_faces: Tensor, faces: Tensor, size: int) -> UVGrid:
     """The surface point under the centre of each pixel of an atlas.
 
-    Pixel (row, column) has its centre at ``u = (column + 1/2) / size``, ``v = (row + 1/2) / size``, which is also
-    where ``grid_sample`` with ``align_corners=False`` places it. It belongs to the triangle that holds its centre,
-    borders included; to that with the lowest index where there are several. ``uv (U, 2)`` are in [0, 1], ``uv_faces``
-    and ``faces (F, 3)`` a triangle's corners in the atlas and on the surface. Raises `AvatarError` for coordinates out
-    of [0, 1], a size below 1, or an atlas that covers no pixel.
+    Pixel (row, column) has its centre at ``u = (column + 1/2) / size``, ``v = (row + 1/2) / size`` and belongs to the
+    triangle that holds it, borders included, of several to that with the lowest index. ``uv (U, 2)`` are in [0, 1],
+    ``uv_faces`` and ``faces (F, 3)`` a triangle's corners in the atlas and on the surface. Raises `AvatarError` for
+    coordinates out of [0, 1], a size below 1, or an atlas that covers no pixel.
     """
     check_atlas(uv, uv_faces, check_shape("faces", faces, "F 3")["F"])
     if size < 1:

@@ -169,9 +169,8 @@ class SkipMlp(nn.Module):
     def start_as_sphere(self, radius: float) -> None:
         """Sets the weights so that the output is about |x| - radius, x being the first three inputs.
 
-        The geometric initialisation of IGR (SAL, Atzmon and Lipman 2020, theorem 1): every hidden layer keeps
-        lengths in the mean, the head averages. Columns of all other inputs start at zero, so waves and pose add
-        nothing at first; they learn all the same.
+        The geometric initialisation of IGR (SAL, Atzmon and Lipman 2020, theorem 1): hidden layers keep lengths in the
+        mean, the head averages. Columns of all other inputs start at zero: waves and pose add nothing at first.
         """
         for place, layer in enumerate(self.layers):
             weight = torch.randn_like(layer.weight) * math.sqrt(2 / layer.out_features)
@@ -200,8 +199,7 @@ class SdfConfig(MlpConfig):
 class PosedSdf(nn.Module):
     """Distance to the dressed surface in canonical space, negative inside, metres, for a pose.
 
-    Inside, the box is centred and shrunk as a whole to [-1, 1], never stretched, so the network's gradient is that
-    of the distance in metres.
+    The box is shrunk as a whole to [-1, 1], never stretched, so the network's gradient is that of the distance.
     """
 
     def __init__(self, pose_channels: int, box: Tensor, config: SdfConfig):

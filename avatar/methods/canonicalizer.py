@@ -130,10 +130,7 @@ class CanonicalizerTask(Task):
 
 
 def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start: Tensor, config: CycleConfig) -> Tensor:
-    """Fits the code ``(L,)`` of a frame that was not trained on, with frozen networks (auto-decoding).
-
-    ``start (L,)`` is the code of a learned frame in a similar pose; ``template`` the body at rest.
-    """
+    """Fits the code ``(L,)`` of a frame that was not trained on, from that of a similar pose, with frozen networks."""
     if model.config.latent is Latent.pose:
         return scan.pose.to(start)
     code = start.detach().clone().requires_grad_()
@@ -189,13 +186,9 @@ class CanonicalizeConfig:
         """Where the run lives: ``<runs>/canonical/<dataset>/<outfit>/<name>``."""
         return self.runs_root / CANONICALIZERS / self.dataset / self.outfit / self.name
 
-    def find_outfit(self) -> Outfit:
-        """The outfit on disk."""
-        return find_outfit(self.data_root, self.dataset, self.outfit, self.scan)
-
     def frames(self) -> FrameDataset:
         """The frames that are canonicalized: first those of training, which are learned from, then those of test."""
-        outfit = self.find_outfit()
+        outfit = find_outfit(self.data_root, self.dataset, self.outfit, self.scan)
         names = name_frames([outfit], "train", [split_outfit(outfit, self.split).train])
         if outfit.has_frames("test"):
             names += name_frames([outfit], "test", [outfit.frames("test")])
@@ -247,10 +240,7 @@ SkinningSource = TrainedCanonicalizer | BodyField  # what gives posed points the
 
 
 def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicalizer:
-    """The trained canonicalizer of a run's folder.
-
-    Raises `DataError` when the folder is no finished run of learned weights, or a file in it is damaged.
-    """
+    """The canonicalizer of a finished run of learned weights; `DataError` where it is missing or damaged."""
     if not (folder / f"{WEIGHTS}.json").is_file():
         hint = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
         raise DataError(folder, "no trained canonicalizer here.", hint)
@@ -267,8 +257,7 @@ def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicaliz
 def find_field(folder: Path, template: Template) -> nn.Module:
     """The forward skinning field of a checked run: the learned one, or the body's for its baselines (nearest, knn).
 
-    Both are posed by the six nearest body vertices, for with the nearest one alone the posed surface would tear
-    wherever the neighbour changes.
+    Both take the six nearest vertices: with one alone the posed surface would tear wherever the neighbour changes.
     """
     path = folder / "config.yaml"
     if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is WeightSource.learned:
@@ -277,10 +266,7 @@ def find_field(folder: Path, template: Template) -> nn.Module:
 
 
 def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
-    """The folder of an outfit's canonicalizer, ``<runs>/canonical/<dataset>/<outfit>/<name>``, after a check.
-
-    Raises `DataError` with the command that makes it, when it is not there or was made for another body.
-    """
+    """The folder of an outfit's canonicalizer; `DataError` with the command that makes it, if missing or another's."""
     folder = runs_root / CANONICALIZERS / outfit.dataset / outfit.name / name
     where = [f"dataset={outfit.dataset}", f"outfit={outfit.name}", f"name={name}"]
     where += [] if runs_root == Path("runs") else [option("runs_root", runs_root)]
@@ -302,10 +288,7 @@ def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
 
 
 def canonical_outfits(runs_root: Path, outfits: list[Outfit], name: str) -> list[Outfit]:
-    """The outfits in canonical space: scans of their canonicalizers' runs in place of the posed ones.
-
-    Raises `DataError` when a training frame's scan has not been canonicalized.
-    """
+    """The outfits with their canonicalizers' scans; `DataError` when a training frame's has not been canonicalized."""
     resting = []
     for outfit in outfits:
         scans = canonicalizer_folder(runs_root, outfit, name) / "scans"

@@ -51,11 +51,7 @@ class ImplicitTrainConfig:
 
 @dataclass
 class ScanimateConfig:
-    """Options of the `scanimate` method: ``method.settings`` of a run.
-
-    Of ``train`` the budget and the optimiser count (steps, minutes, batch, scan_points, lr, schedule, warmup, clip,
-    mirror, seed and how often to log, validate and save); template points and point losses have no part in it.
-    """
+    """Options of the `scanimate` method; of a run's ``train``, template points and point losses have no part in it."""
 
     avatar: ImplicitConfig = field(default_factory=ImplicitConfig)
     train: ImplicitTrainConfig = field(default_factory=ImplicitTrainConfig)
@@ -179,10 +175,7 @@ class Scanimate(Method):
 
 
 def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequence[CanonicalFrame]:
-    """The canonical scans of training frames with their poses, read when they are needed.
-
-    Raises `DataError` for a scan that is not there, or without colours where they are to be learned.
-    """
+    """Canonical scans of training frames, read when needed; `DataError` for one without the colours to be learned."""
 
     def read(index: int) -> CanonicalFrame:
         frame = canonical_frame(outfit.load("train", names[index]))

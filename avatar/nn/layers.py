@@ -69,8 +69,7 @@ class _GatherMoments(torch.autograd.Function):
 class SharedNorm(_BatchNorm):
     """Batch normalisation over the batches of all ranks, with the parameters and buffers of the layer it stands for.
 
-    nn.SyncBatchNorm does this on CUDA alone. Each process gives count, mean and variance; the whole batch's follow from
-    them without cancellation (Chan's formula).
+    As nn.SyncBatchNorm on CUDA; the batch's moments follow from each rank's without cancellation (Chan's formula).
     """
 
     dimension = -1  # of the channels
@@ -110,8 +109,7 @@ def synchronize_norms(model: nn.Module, replicated: Collection[str] = ()) -> Non
     """Turns the batch normalisations of a model into `SharedNorm`s, in place; names and weights stay the same.
 
     Those of the ``replicated`` submodules stay as they are: every process runs them on all outfits of the step
-    (`step_outfits`), so each has the whole batch's statistics by itself. Raises `AvatarError` for a kind of
-    normalisation whose statistics it would not know how to synchronise.
+    (`step_outfits`). Raises `AvatarError` for a kind of normalisation that it does not know.
     """
     for path, parent in list(model.named_modules()):
         if path.partition(".")[0] in replicated:

@@ -37,10 +37,9 @@ class UNetConfig:
 
 
 class Doubling(nn.Module):
-    """Bilinear interpolation of images to twice their size, ``(..., H, W)`` to ``(..., 2 H, 2 W)``.
+    """Bilinear interpolation of images, ``(..., H, W)`` to ``(..., 2 H, 2 W)`` (``align_corners=False``).
 
-    The same as torch's (``align_corners=False``) but as two matrix products, whose backward pass is repeatable on CUDA,
-    where torch's own adds in an order of chance.
+    Two matrix products: unlike torch's own, their backward pass is repeatable on CUDA.
     """
 
     def forward(self, image: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ class Stopped(Exception):
 
 @contextmanager
 def listening(listener: Callable[[int, FrameType | None], Any], numbers: Iterable[int]) -> Iterator[dict[int, Any]]:
-    """Has signals of the main thread handled by a function for the length of a ``with`` block; gives earlier handlers."""
+    """Has signals of the main thread handled by a function within a ``with`` block; gives the earlier handlers."""
     ours = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, listener) for number in numbers} if ours else {}
     try:

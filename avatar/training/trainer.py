@@ -88,26 +88,21 @@ class Trainer:
                 self.step += 1
                 stopping = self.sync_clock(time.monotonic() - started, stop)
                 bar.advance()
-                done, score = self.progress() >= 1, None
+                done, rows = self.progress() >= 1, {}
                 if self.step % budget.log_every == 0 or done:
                     values = self.world_mean(self.task.log_values(terms)) | {"lr": rate, "grad_norm": float(norm)}
                     bar.show(**self.task.shown(values))
-                    self.write(log, "train", values)
+                    rows["train"] = values
                 if self.step % budget.validate_every == 0 or done:
-                    values = self.validate()
-                    score = values.get(self.task.criterion)
-                    self.write(log, "validation", values)
+                    rows["validation"] = self.validate()
+                for split, values in rows.items() if log else ():
+                    log.write(split, self.step, self.step * self.task.batch // self.task.frames, self.seconds, values)
+                score = rows.get("validation", {}).get(self.task.criterion)
                 due = self.step % budget.save_every == 0 or score is not None
                 if (due and not self.bad_steps) or done or stopping:
                     self.save(score)
                 if stopping and not done:
                     stop.leave(self.folder)
-
-    def write(self, log: TrainingLog | None, split: str, values: dict[str, float]) -> None:
-        """Writes one row of the log on the main rank."""
-        if log and values:
-            epoch = self.step * self.task.batch // self.task.frames
-            log.write(split, self.step, epoch, self.seconds, values)
 
     def sync_clock(self, seconds: float, stop: StopRequest) -> bool:
         """Averages the elapsed time over all ranks; True if any rank received a stop signal."""
@@ -215,7 +210,7 @@ class Trainer:
             save_checkpoint(self.folder / "checkpoints", state, self.step, score)
 
     def resume(self) -> None:
-        """Goes back to the newest valid checkpoint, or seeds the random state; `DataError` for another run's or format."""
+        """Goes back to the newest valid checkpoint, else seeds the random state; `DataError` for one of another run."""
         world, folder = self.world, self.folder / "checkpoints"
         state = broadcast(load_checkpoint(folder) if world.is_main else None, world)
         torch.manual_seed(self.budget.seed + SEED_STRIDE * world.rank)
@@ -249,10 +244,9 @@ def spent(budget: Budget, steps: int, seconds: float) -> float:
 class Feed:
     """The inputs of training steps on a device: while a step trains there, a thread prepares those of the next one.
 
-    They are the same as without it, for they follow from the step alone. Used as a ``with`` block, at whose end nothing
-    goes on in the background. For CUDA they are copied from pinned memory, beside the work of the step before. On the
-    CPU they are prepared on request: a thread with work of its own would have OpenMP threads of its own, and OpenMP
-    then lets all of them sleep at once (docs/performance.md).
+    Used as a ``with`` block, at whose end nothing goes on in the background. For CUDA they are copied from pinned
+    memory. On the CPU they are prepared on request: a thread with work of its own would have OpenMP threads of its own,
+    and OpenMP then lets all of them sleep at once (docs/performance.md).
     """
 
     def __init__(self, make: Callable[[int], Inputs], steps: int, device: torch.device):
@@ -290,16 +284,10 @@ def to_device(records: Inputs, device: torch.device) -> Inputs:
 
 
 class TrainingLog:
-    """Appends rows to ``metrics.csv``, and to TensorBoard where it is installed; a resumed run goes on in its file.
-
-    Rows hold ``split`` (train or validation), ``step``, ``epoch``, ``seconds`` and one column for every term.
-    """
+    """Rows of ``metrics.csv``, and of TensorBoard where it is installed: split, step, epoch, seconds and every term."""
 
     def __init__(self, folder: Path, columns: list[str], from_step: int):
-        """Begins the log of a run, or drops rows past the step a resumed run starts from.
-
-        Raises `DataError` when the log cannot be written; the one there is stays as it is.
-        """
+        """Begins the log of a run, or drops rows past the step a resumed run starts from; `DataError` if it cannot."""
         self.path = folder / "metrics.csv"
         self.columns = ["split", "step", "epoch", "seconds", *columns]
         kept = [row for row in read_log(self.path) if int(row["step"]) <= from_step] if self.path.is_file() else []
@@ -317,7 +305,9 @@ class TrainingLog:
         return text.getvalue()
 
     def write(self, split: str, step: int, epoch: int, seconds: float, values: dict[str, float]) -> None:
-        """Writes one row. Raises `DataError` when the disk refuses."""
+        """Writes one row, of values there are. Raises `DataError` when the disk refuses."""
+        if not values:
+            return
         row = {"split": split, "step": step, "epoch": epoch, "seconds": f"{seconds:.2f}"}
         try:
             with self.path.open("a", newline="") as file:
