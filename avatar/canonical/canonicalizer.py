@@ -66,14 +66,15 @@ class Cycle:
 class Canonicalizer(nn.Module):
     """Forward and inverse skinning fields of one outfit's frames (SCANimate 3.1).
 
-    ``codes (frames, L)`` are the frames' codes, in the order of training; without use where the pose stands for them.
+    ``codes (frames, L)`` are the frames' codes, in the order of training; without use where the model is not ``coded``.
     """
 
     def __init__(self, template: Template, frames: int, config: CanonicalizerConfig):
         """Builds untrained fields for a body and a number of frames to learn from."""
         super().__init__()
         self.config, joints, box = config, len(template.parents), bounding_box(template.vertices)
-        length = config.inverse.latent if config.latent is Latent.auto_decoded else 3 * (joints - 1)
+        self.coded = config.latent is Latent.auto_decoded
+        length = config.inverse.latent if self.coded else 3 * (joints - 1)
         self.inverse = SkinningField(joints, replace(config.inverse, latent=length), box)
         self.codes = nn.Parameter(CODE_SPREAD * torch.randn(frames, length))
         if config.shared:
@@ -95,7 +96,7 @@ class Canonicalizer(nn.Module):
 
     def batch_codes(self, batch: ScanBatch) -> Tensor:
         """Conditioning of the inverse field on each frame of a batch, ``(B, L)``."""
-        return batch.poses if self.config.latent is Latent.pose else pick(self.codes, batch.frames)
+        return pick(self.codes, batch.frames) if self.coded else batch.poses
 
     def transforms(self, weights: Tensor, joint_transforms: Tensor) -> Tensor:
         """LBS: posed_from_canonical ``(B, N, 4, 4)`` of points with weights ``(B, N, J)``."""
@@ -116,7 +117,7 @@ class Canonicalizer(nn.Module):
         canonical = canonical if together else canonical.detach()
         weights = self.canonical_weights(torch.cat([canonical, batch.canonical_body], dim=1))
         canonical_weights, canonical_body = weights.split(counts[:2], dim=1)
-        codes = codes if self.config.latent is Latent.auto_decoded else None
+        codes = codes if self.coded else None
         reposed = ends = None
         if together:
             reposed = transform_points(self.transforms(canonical_weights, batch.joint_transforms), canonical)

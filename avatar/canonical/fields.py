@@ -40,11 +40,7 @@ class SkinningField(nn.Module):
     """Skinning weights of any point in space, positive and summing to 1; differentiable in the points."""
 
     def __init__(self, joints: int, config: SkinningFieldConfig, box: Tensor):
-        """Builds an untrained field of ``joints`` weights.
-
-        ``box (2, 3)`` are the corners of the space it is about, metres (`bounding_box`); points outside are answered
-        as well.
-        """
+        """Builds an untrained field of ``joints`` weights about a box ``(2, 3)``, metres, and the space around it."""
         super().__init__()
         check_shape("box", box, "2 3")
         self.joints, self.config = joints, config
@@ -88,10 +84,9 @@ class SkinningField(nn.Module):
 
 
 class BodyField(nn.Module):
-    """Weights of the nearest body vertices, by inverse distance (SCANimate 4.1's baselines); of one, its own.
+    """Weights of the nearest body vertices, by inverse distance: SCANimate 4.1's baselines of learned fields.
 
-    Stands where learned fields would: the forward one in canonical space, where it is differentiable in the points but
-    for changes of neighbours, and the inverse one in posed space.
+    In canonical space they are differentiable in the points but for changes of neighbours.
     """
 
     def __init__(self, template: Template, neighbours: int = KNN):

@@ -26,11 +26,10 @@ TORN_SHARE = 0.5  # of a point's edges to its neighbours, beyond which a point s
 
 
 def smooth_edges(scan: Scan, count: int, rng: np.random.Generator) -> np.ndarray:
-    """At most ``count`` edges ``(E, 2)`` of a scan with neither end in a concave region.
+    """At most ``count`` edges ``(E, 2)`` of a scan, of triangles or to nearest points, with no end in a concave region.
 
-    Edges of the triangles of a mesh, or from points to a few of their nearest ones. Body parts that touch run together
-    in a scan, and where they do the surface is concave: weights must not be smoothed across (SCANimate eq. 12 and
-    appendix A.4). A scan that is concave everywhere, such as one with its normals turned inside, keeps its edges.
+    Where body parts that touch run together in a scan it is concave: weights must not be smoothed across (SCANimate
+    eq. 12, appendix A.4). A scan that is concave everywhere, such as one with normals turned inside, keeps its edges.
     """
     if scan.faces is None:
         edges = neighbour_edges(scan.points, rng.permutation(len(scan.points))[: -(-count // EDGE_NEIGHBOURS)])
@@ -56,8 +55,7 @@ def nearest_ids(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarr
 def mean_curvature(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Mean curvature ``(N,)`` of the surface under oriented points, 1/m: positive where it bulges, negative in hollows.
 
-    From how far the neighbours lie below the tangent plane; exact on spheres, and not troubled by a scanner's noise,
-    because the neighbours are drawn from a thinned cloud and so lie centimetres away.
+    From how far neighbours lie below the tangent plane; in a thinned cloud they are centimetres away, beyond noise.
     """
     check_shape("normals", normals, "N 3", **check_shape("points", points, "N 3"))
     thinned = points[:: -(-len(points) // CURVATURE_POINTS)]
@@ -200,10 +198,9 @@ def canonicalize_scan(
 ) -> CanonicalScan:
     """Inverse LBS of every point of a posed scan over its body (SCANimate eq. 1), then the cut of what was stretched.
 
-    Where surfaces touched in the scan, edges run from one to the other and are stretched when they part: triangles
-    with an edge beyond ``stretch`` go, and points left without a triangle. A scan of points loses those that
-    parted from most of their neighbours. ``weights (M, J)`` are the points', rows summing to 1. Raises `AvatarError`
-    for weights that do not fit, or when nothing is left of the scan.
+    Edges between surfaces that touched are stretched when these part: triangles with an edge beyond ``stretch`` go, and
+    points left without any; a scan of points loses those that parted from most of their neighbours. ``weights (M, J)``
+    have rows summing to 1. Raises `AvatarError` for weights that do not fit, or when nothing is left of the scan.
     """
     check_shape("weights", weights, "M J", M=len(scan.points), J=len(template.parents))
     check_finite("weights", weights)

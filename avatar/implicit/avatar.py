@@ -14,17 +14,9 @@ from avatar.checks import AvatarError, check_range, check_shape
 from avatar.geometry.chunks import in_chunks
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import transform_points
+from avatar.implicit import networks
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
-from avatar.implicit.networks import (
-    Attention,
-    FieldLattice,
-    MlpConfig,
-    PosedSdf,
-    PoseGate,
-    SdfConfig,
-    TextureField,
-    joint_quaternions,
-)
+from avatar.implicit.networks import Attention, MlpConfig, SdfConfig
 from avatar.records import Mesh, PointCloud, Template
 
 CHUNK = 65_536  # points skinned or coloured at once
@@ -62,22 +54,21 @@ class ImplicitAvatar(nn.Module):
     """
 
     def __init__(self, template: Template, field: nn.Module, box: Tensor, config: ImplicitConfig):
-        """Builds an untrained avatar on the body at rest.
+        """Builds an untrained avatar on the body at rest; ``field`` gives ``(B, N, J)`` weights of canonical points.
 
-        ``field`` is the forward skinning field, ``(B, N, 3)`` canonical points to ``(B, N, J)`` weights; ``box (2, 3)``
-        are the corners of canonical space that clothes can reach, metres.
+        The ``box (2, 3)`` has the corners of canonical space that clothes can reach, metres.
         """
         super().__init__()
         self.config, self.parents = config, tuple(template.parents)
         self.field = field.eval().requires_grad_(False)
         self.register_buffer("box", box.detach().clone(), persistent=False)
         self.register_buffer("canonical_from_bind", template.canonical_from_bind, persistent=False)
-        self.gate = PoseGate(self.parents, config.rings, config.attention, config.normalised)
+        self.gate = networks.PoseGate(self.parents, config.rings, config.attention, config.normalised)
         lattice = config.pose is PoseInput.local and config.gate_spacing
-        self.near_field = FieldLattice(self.field, self.box, config.gate_spacing) if lattice else None
-        self.sdf = PosedSdf(0 if config.pose is PoseInput.none else self.gate.channels, self.box, config.sdf)
+        self.near_field = networks.FieldLattice(self.field, self.box, config.gate_spacing) if lattice else None
+        self.sdf = networks.PosedSdf(0 if config.pose is PoseInput.none else self.gate.channels, self.box, config.sdf)
         inputs = self.sdf.mlp.layers[0].in_features
-        self.texture = TextureField(inputs, self.sdf.mlp.channels, config.texture) if config.colored else None
+        self.texture = networks.TextureField(inputs, self.sdf.mlp.channels, config.texture) if config.colored else None
 
     def pose_features(self, points: Tensor, joint_transforms: Tensor) -> Tensor:
         """Pose features ``(B, N, P)`` of each point; see `PoseInput`."""
@@ -85,7 +76,7 @@ class ImplicitAvatar(nn.Module):
         if self.config.pose is PoseInput.none:
             return points.new_zeros(*points.shape[:2], 0)
         if self.config.pose is PoseInput.global_:
-            quaternions = joint_quaternions(joint_transforms, self.parents).flatten(1)
+            quaternions = networks.joint_quaternions(joint_transforms, self.parents).flatten(1)
             return quaternions[:, None].expand(-1, dims["N"], -1)
         return self.gate((self.near_field or self.field)(points), joint_transforms)
 

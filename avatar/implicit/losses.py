@@ -120,11 +120,10 @@ def sample_queries(
 
 
 def query_field(avatar: ImplicitAvatar, scan: Tensor, space: QueryPoints, joint_transforms: Tensor) -> FieldValues:
-    """Distances and their gradients at the points of a step, in one evaluation, and colours where there are any.
+    """Distances, their gradients and colours, where there are any, at the points of a step, in one evaluation.
 
-    Gradients are those of the whole field, what the pose features change from place to place included. With
-    gradients switched on they can be differentiated again, as training does. ``scan (B, S, 3)`` are canonical scan
-    points, ``joint_transforms (B, J, 4, 4)`` posed_from_canonical.
+    Of canonical ``scan (B, S, 3)`` and ``joint_transforms (B, J, 4, 4)`` posed_from_canonical. Gradients are those of
+    the whole field, pose features included; with gradients switched on they can be differentiated again.
     """
     parts = [scan, space.near, space.uniform, space.boundary]
     learning = torch.is_grad_enabled()

@@ -78,10 +78,9 @@ class PoseGate(nn.Module):
 
 
 class FieldLattice(nn.Module):
-    """A frozen field ``(B, N, 3) -> (B, N, C)`` as trilinear look-ups: a hundredth of a network's work a point.
+    """A frozen field ``(B, N, 3) -> (B, N, C)`` as trilinear look-ups, for those smooth over a few centimetres.
 
-    For fields that hardly change over a few centimetres, as skinning weights do. Differentiable in the points;
-    outside its box the value at the border is given.
+    Differentiable in the points; outside its box the value at the border is given.
     """
 
     def __init__(self, field: Callable[[Tensor], Tensor], box: Tensor, spacing: float):

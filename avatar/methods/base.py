@@ -21,10 +21,9 @@ CANONICALIZER = "canonicalizer"  # a method's need: a trained canonicalizer for 
 
 @dataclass(frozen=True)
 class Stage:
-    """Part of training with its own learning rates; it begins with a fresh optimiser state.
+    """Part of training, a ``share`` of the budget, that begins with a fresh optimiser state.
 
-    ``share`` of the budget; ``rates``, one for each of the task's parameter groups; ``factor(step, progress)`` on all
-    of them, at a step of the run and a share of the stage.
+    It has ``rates``, one for each parameter group of the task, with a ``factor(step of the run, share of the stage)``.
     """
 
     share: float

@@ -18,7 +18,6 @@ from avatar.canonical.canonicalizer import (
     Canonicalizer,
     CanonicalizerConfig,
     CanonicalLossConfig,
-    Latent,
     canonicalization_loss,
 )
 from avatar.canonical.fields import BodyField, SkinningField, bounding_box
@@ -131,7 +130,7 @@ class CanonicalizerTask(Task):
 
 def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start: Tensor, config: CycleConfig) -> Tensor:
     """Fits the code ``(L,)`` of a frame that was not trained on, from that of a similar pose, with frozen networks."""
-    if model.config.latent is Latent.pose:
+    if not model.coded:
         return scan.pose.to(start)
     code = start.detach().clone().requires_grad_()
     nearest = BodyField(template, 1).to(code.device)
@@ -220,7 +219,7 @@ class TrainedCanonicalizer:
         """The code ``(L,)`` of a frame: the learned one, or found for its scan where it was not learned from."""
         codes = self.model.codes.detach()
         learned = frame.split == "train" and frame.outfit == self.config.outfit and frame.name in self.frames
-        if learned and self.model.config.latent is Latent.auto_decoded:
+        if learned and self.model.coded:
             return codes[self.frames.index(frame.name)]
         scan = prepare_scan(frame, self.template, self.config.train.draw.pool)
         alike = (self.poses - scan.joint_transforms).square().sum(dim=(1, 2, 3)).argmin()

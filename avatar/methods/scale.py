@@ -82,16 +82,12 @@ class PointNet(nn.Module):
 class ScaleAvatar(nn.Module):
     """The SCALE network of one outfit: patches fixed to triangles of the posed body.
 
-    A patch belongs to a pixel of the position map: it has that pixel's feature, its place on the body and the frame of
-    the triangle there. Its points differ by patch coordinates alone, the cell of the pixel that a point stands for. A
-    point of the body that lies in no patch's pixel belongs to the patch nearest in the atlas.
+    A patch has the feature of a pixel of the position map, its place on the body and its triangle's frame; points of it
+    differ by their cell of the pixel alone. A point in no patch's pixel belongs to the patch nearest in the atlas.
     """
 
     def __init__(self, template: Template, outfits: int, config: ScaleConfig):
-        """Builds the network on a body template with UV coordinates.
-
-        Raises `AvatarError` for more than one outfit, which SCALE has no code for.
-        """
+        """Builds the network on a body with UV coordinates; `AvatarError` for several outfits, which have no codes."""
         super().__init__()
         if outfits != 1:
             raise AvatarError(f"outfit: SCALE models one outfit, got {outfits}; train a run for each.")
@@ -119,7 +115,7 @@ class ScaleAvatar(nn.Module):
         return SurfaceSamples(atlas.map_vertex_ids[rows], atlas.map_barycentric[rows], atlas.map_face_ids[rows])
 
     def template_samples(self, points: int) -> SurfaceSamples:
-        """The points this network predicts when about ``points`` are asked for: k x k cells of every patch's pixel.
+        """About ``points`` places where this network predicts: k x k cells of every patch's pixel.
 
         A cell off the patch's triangle lies in the plane of it, so its barycentric coordinates may be negative.
         """
@@ -144,10 +140,7 @@ class ScaleAvatar(nn.Module):
         return self.pose_encoder(centres)[:, None].expand(-1, centres.shape[1], -1)
 
     def patch_frames(self, vertices: Tensor) -> Tensor:
-        """Frames of the patches' posed triangles: two edges, and the normal as long as edges are on average.
-
-        ``(B, V, 3)`` to ``(B, P, 3, 3)`` with the axes as columns; neither orthogonal nor of unit length.
-        """
+        """Frames ``(B, P, 3, 3)`` of posed triangles, axes as columns: two edges, a normal as long as their mean."""
         first, second, third = (vertices[:, ids] for ids in self.patches.vertex_ids.unbind(dim=1))
         edges = torch.stack([second - first, third - first], dim=-1)
         length = edges.norm(dim=-2).mean(dim=(1, 2))[:, None, None]
