@@ -144,7 +144,7 @@ class CanonicalLossConfig:
         check_range(self, "beta", above=0, high=1)
 
 
-def canonicalization_loss(
+def cycle_loss(
     cycle: Cycle, batch: ScanBatch, nearest: BodyField, config: CanonicalLossConfig, progress: float = 0.0
 ) -> LossTerms:
     """The objective of either stage, reduced to means over frames and points.

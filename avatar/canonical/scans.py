@@ -215,14 +215,8 @@ def canonicalize_scan(
     kept, faces = cut_stretched(scan, points, stretch)
     if not len(kept):
         raise AvatarError("weights: expected some of the scan to hold together in the canonical pose, nothing did.")
-    return CanonicalScan(
-        points=points[kept],
-        normals=normals[kept],
-        weights=weights[kept].astype(np.float32),
-        source=kept,
-        faces=faces,
-        colors=None if scan.colors is None else scan.colors[kept],
-    )
+    colors = None if scan.colors is None else scan.colors[kept]
+    return CanonicalScan(points[kept], normals[kept], weights[kept].astype(np.float32), kept, faces, colors)
 
 
 def cut_stretched(scan: Scan, points: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray | None]:

@@ -13,13 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.body.packed import read_template
-from avatar.canonical.canonicalizer import (
-    TERMS,
-    Canonicalizer,
-    CanonicalizerConfig,
-    CanonicalLossConfig,
-    canonicalization_loss,
-)
+from avatar.canonical.canonicalizer import TERMS, Canonicalizer, CanonicalizerConfig, CanonicalLossConfig, cycle_loss
 from avatar.canonical.fields import BodyField, SkinningField, bounding_box
 from avatar.canonical.scans import STRETCH, DrawConfig, PosedScan, ScanBatch, draw_batch, prepare_scan, to_root_frame
 from avatar.checks import DataError, check_name, check_range
@@ -119,7 +113,7 @@ class CanonicalizerTask(Task):
         (batch,), together = inputs, position.stage > 0
         cycle = self.model(batch, self.model.batch_codes(batch), together=together)
         progress = position.progress if together else 0.0
-        return canonicalization_loss(cycle, batch, self.nearest, self.config.loss, progress)
+        return cycle_loss(cycle, batch, self.nearest, self.config.loss, progress)
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:
         return super().shown(values) | {"cycle": f"{1e3 * values.get('cycle_points', 0):.1f}mm"}
@@ -141,7 +135,7 @@ def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start:
         batch = draw_batch([scan], [0], template.weights.cpu(), config.draw, generator)
         batch = map_tensors(batch, lambda tensor: tensor.to(code.device))
         cycle = model(batch, code[None], together=True)
-        loss = canonicalization_loss(cycle, batch, nearest, config.loss, step / config.code_steps).total
+        loss = cycle_loss(cycle, batch, nearest, config.loss, step / config.code_steps).total
         (code.grad,) = torch.autograd.grad(loss, [code])
         optimiser.step()
     return code.detach()

@@ -196,16 +196,9 @@ class Trainer:
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
-        state = {
-            "format": FORMAT,
-            "model": self.model.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "step": self.step,
-            "stage": self.stage,
-            "seconds": self.seconds,
-            "random": gather(random, self.world),
-            "threads": torch.get_num_threads(),
-        }
+        state = {"format": FORMAT, "model": self.model.state_dict(), "optimiser": self.optimiser.state_dict()}
+        state |= {"step": self.step, "stage": self.stage, "seconds": self.seconds}
+        state |= {"random": gather(random, self.world), "threads": torch.get_num_threads()}
         if self.world.is_main:
             save_checkpoint(self.folder / "checkpoints", state, self.step, score)
 
