@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -91,6 +92,21 @@ def check_trained(path: Path) -> tuple[Path, Path]:
 def plain_name(text: str, otherwise: str) -> str:
     """The nearest plain name to what a file calls itself; ``otherwise`` where nothing of it is left."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).lstrip("_.-")[:64] or otherwise
+
+
+def check_range(
+    settings: Any, *names: str, low: float = -math.inf, above: float = -math.inf, high: float = math.inf
+) -> None:
+    """Refuses settings of which a named field is below ``low``, not ``above`` a number or beyond ``high``.
+
+    None, which stands for no limit, passes. Raises `AvatarError` naming the field, its range and its value.
+    """
+    bounds = {"at least": low, "above": above, "at most": high}
+    expected = " and ".join(f"{word} {bound}" for word, bound in bounds.items() if math.isfinite(bound))
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and not (low <= value <= high and value > above):
+            raise AvatarError(f"{name}: expected {expected}, got {value}.")
 
 
 def check_shape(name: str, value: Any, pattern: str, **dims: int) -> dict[str, int]:

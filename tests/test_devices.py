@@ -13,7 +13,7 @@ from tiny import DECODER, SETTINGS, canonical_truth, quick_training
 
 from avatar.canonical.canonicalizer import CanonicalizerConfig
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.posed import DrawConfig
+from avatar.canonical.scans import DrawConfig
 from avatar.checks import AvatarError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
@@ -48,12 +48,12 @@ SCALE = {
     "map_size": 16,
     "patches": 60,
 }
-PROBES = {"near_points": 60, "box_points": 40, "rim_points": 20}
+QUERIES = {"near_points": 60, "box_points": 40, "boundary_points": 20}
 SDF = {"widths": [32, 32], "skip": 1, "orders": 2}
 
 
 def implicit(**switches) -> dict:
-    return {"avatar": {"sdf": SDF, "texture": SDF, "gate_spacing": 0.2} | switches, "train": {"probes": PROBES}}
+    return {"avatar": {"sdf": SDF, "texture": SDF, "gate_spacing": 0.2} | switches, "train": {"queries": QUERIES}}
 
 
 METHODS = {

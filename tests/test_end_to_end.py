@@ -11,7 +11,7 @@ from tiny import SETTINGS, quick_training
 
 from avatar.canonical.canonicalizer import CanonicalizerConfig
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.posed import DrawConfig
+from avatar.canonical.scans import DrawConfig
 from avatar.checks import AvatarError, DataError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import split_outfit

@@ -15,8 +15,7 @@ from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.evaluation.closest import closest_on_mesh
 from avatar.evaluation.crossings import crossing_faces
 from avatar.evaluation.views import normal_map_error, render_normals, silhouette_overlap, view_frame
-from avatar.geometry.distances import normal_difference, point_to_plane, point_to_point
-from avatar.geometry.neighbours import k_nearest, nearest
+from avatar.geometry.neighbours import k_nearest, nearest, normal_difference, point_to_plane, point_to_point
 from avatar.geometry.surface import vertex_normals
 from avatar.records import Mesh, PointCloud, Scan
 

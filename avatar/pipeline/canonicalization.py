@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avatar.canonical.scans import SkinningSource, canonicalize_scan
+from avatar.canonical.fields import BodyField
+from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset
 from avatar.environment import prepared_process
@@ -31,7 +32,7 @@ from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, module_digest
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole
-from avatar.methods.canonicalizer import CanonicalizeConfig, TrainedCanonicalizer, WeightSource
+from avatar.methods.canonicalizer import CanonicalizeConfig, SkinningSource, TrainedCanonicalizer, WeightSource
 from avatar.pipeline.scores import current_commit
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
@@ -112,16 +113,14 @@ def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> S
 def canonicalizer_with(config: CanonicalizeConfig, source: SkinningSource) -> Callable[[Frame], Canonicalized]:
     """What a source of weights makes of a frame, with the weights that it gives to canonical points."""
     template = source.template
-    field = source.forward_field if isinstance(source, TrainedCanonicalizer) else None
+    field = source if isinstance(source, BodyField) else source.forward_field
 
     def unpose(frame: Frame) -> Canonicalized:
         weights = source.weights_of(frame.scan.points, frame)
         scan = canonicalize_scan(frame.scan, frame.body, weights, template, config.stretch)
-        if field is not None:
-            points = torch.from_numpy(scan.points)[None].to(next(field.parameters()).device)
-            with torch.no_grad():
-                return Canonicalized(scan, field(points)[0].cpu().numpy())
-        return Canonicalized(scan, source.blend_weights(scan.points, template.vertices.numpy()))
+        points = torch.from_numpy(scan.points)[None].to(next(field.buffers()).device)
+        with torch.no_grad():
+            return Canonicalized(scan, field(points)[0].cpu().numpy())
 
     return unpose
 

@@ -9,8 +9,8 @@ import torch
 
 from avatar.body.packed import write_template
 from avatar.canonical.canonicalizer import Canonicalizer
-from avatar.canonical.posed import prepare_scan
-from avatar.canonical.scans import KNN, NearestBody, SkinningSource, canonicalize_scan
+from avatar.canonical.fields import KNN, BodyField
+from avatar.canonical.scans import canonicalize_scan, prepare_scan
 from avatar.checks import DataError
 from avatar.data.batches import FrameDataset, LruSequence
 from avatar.data.validation import check_frame_count
@@ -25,6 +25,7 @@ from avatar.methods.canonicalizer import (
     WEIGHTS,
     CanonicalizeConfig,
     CanonicalizerTask,
+    SkinningSource,
     WeightSource,
     load_canonicalizer,
 )
@@ -112,7 +113,7 @@ def skinning_source(config: CanonicalizeConfig, template: Template) -> SkinningS
     """What gives a run's scans their weights: its trained canonicalizer, or the body nearby."""
     if config.weights is WeightSource.learned:
         return load_canonicalizer(config.folder, config.device)
-    return NearestBody(template, KNN if config.weights is WeightSource.knn else 1)
+    return BodyField(template, KNN if config.weights is WeightSource.knn else 1)
 
 
 def scans_digest(config: CanonicalizeConfig) -> str:

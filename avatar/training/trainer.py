@@ -1,27 +1,30 @@
-"""The trainer of every method: stages, budget, bad steps, log, validation, checkpoints, stop signals and ranks."""
+"""The trainer of every method: stages, budget, bad steps, inputs, log, validation, checkpoints, signals, ranks."""
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 import math
-from contextlib import nullcontext
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor, nn
 
-from avatar.checks import AvatarError, DataError
+from avatar.checks import AvatarError, DataError, require
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
+from avatar.io.npz import write_whole
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Task
 from avatar.methods.settings import Clock
 from avatar.nn.layers import synchronize_norms
 from avatar.progress import Progress
-from avatar.records import LossTerms
-from avatar.training.feeding import Feed, to_device
-from avatar.training.logs import TrainingLog
+from avatar.records import LossTerms, map_tensors
 from avatar.training.signals import StopRequest, stop_requests
 from avatar.world import average, broadcast, current_world, gather, gradients_of
 
@@ -60,9 +63,9 @@ class Trainer:
         self.step, self.seconds, self.stage, self.bad_steps = 0, 0.0, 0, 0
 
     def fit(self) -> None:
-        """Trains until the budget is spent; holds the lock of the run's folder while it does.
+        """Trains until the budget is spent, holding the lock of the run's folder.
 
-        Raises `AvatarError` when losses or gradients stay non-finite, or another job holds the folder. Raises `Stopped`
+        Raises `AvatarError` when losses or gradients stay non-finite or another job holds the folder, and `Stopped`
         after SIGTERM or SIGUSR1, with everything saved.
         """
         with lock_folder(self.folder) if self.world.is_main else nullcontext(), stop_requests() as stop:
@@ -72,8 +75,8 @@ class Trainer:
             try:
                 self.run(log, stop)
             finally:
-                if log:
-                    log.close()
+                if log and log.board:
+                    log.board.close()
 
     def run(self, log: TrainingLog | None, stop: StopRequest) -> None:
         """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
@@ -87,26 +90,21 @@ class Trainer:
                 self.step += 1
                 stopping = self.sync_clock(budget.clock.seconds() - started, stop)
                 bar.advance()
-                done, score = self.progress() >= 1, None
+                done, rows = self.progress() >= 1, {}
                 if self.step % budget.log_every == 0 or done:
                     values = self.world_mean(self.task.log_values(terms)) | {"lr": rate, "grad_norm": float(norm)}
                     bar.show(**self.task.shown(values))
-                    self.write(log, "train", values)
+                    rows["train"] = values
                 if self.step % budget.validate_every == 0 or done:
-                    values = self.validate()
-                    score = values.get(self.task.criterion)
-                    self.write(log, "validation", values)
+                    rows["validation"] = self.validate()
+                for split, values in rows.items() if log else ():
+                    log.write(split, self.step, self.step * self.task.batch // self.task.frames, self.seconds, values)
+                score = rows.get("validation", {}).get(self.task.criterion)
                 due = self.step % budget.save_every == 0 or score is not None
                 if (due and not self.bad_steps) or done or stopping:
                     self.save(score)
                 if stopping and not done:
                     stop.leave(self.folder)
-
-    def write(self, log: TrainingLog | None, split: str, values: dict[str, float]) -> None:
-        """Writes one row of the log on the main rank."""
-        if log and values:
-            epoch = self.step * self.task.batch // self.task.frames
-            log.write(split, self.step, epoch, self.seconds, values)
 
     def sync_clock(self, seconds: float, stop: StopRequest) -> bool:
         """Averages the elapsed time over all ranks; True if any rank received a stop signal."""
@@ -126,19 +124,19 @@ class Trainer:
 
     def position(self) -> Position:
         """The stage that the next step belongs to, and how far in it that is."""
-        progress, start = self.progress(), 0.0
-        stages = self.task.stages
-        for index, stage in enumerate(stages):
+        progress, start, last = self.progress(), 0.0, len(self.task.stages) - 1
+        for index, stage in enumerate(self.task.stages):
             end = start + stage.share
-            if progress < end or index == len(stages) - 1:
-                return Position(index, min(1.0, round((progress - start) / (end - start), 12)))
+            if progress < end or index == last:
+                break
             start = end
-        raise AssertionError("expected at least one stage")
+        return Position(index, min(1.0, round((progress - start) / (end - start), 12)))
 
     def train_step(self, inputs: Inputs) -> tuple[LossTerms, float, Tensor]:
         """One optimiser step on inputs that are on the device; gives loss terms, learning rate and gradient norm.
 
-        A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were.
+        A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were; too
+        many of them in a row raise `AvatarError`.
         """
         self.model.train()
         position = self.position()
@@ -167,21 +165,17 @@ class Trainer:
             self.bad_steps = 0
         else:
             self.restore_statistics(before)
-            self.count_bad_step(inputs)
+            self.bad_steps += 1
+        if self.bad_steps > MAX_BAD_STEPS:
+            where = f"(step {self.step}, frames {', '.join(self.task.frame_names(inputs))})"
+            hint = "lower the learning rate or check these frames; the last checkpoint is valid."
+            raise AvatarError(f"loss: not finite for {self.bad_steps} steps in a row {where}. Hint: {hint}")
         return terms, stage.rates[0] * factor, norm
 
     def restore_statistics(self, values: list[Tensor]) -> None:
         """Puts back the running statistics from before a step that was not finite."""
         for statistic, value in zip(self.statistics, values):
             statistic.copy_(value)
-
-    def count_bad_step(self, inputs: Inputs) -> None:
-        """Ends training after too many steps in a row that were not finite."""
-        self.bad_steps += 1
-        if self.bad_steps > MAX_BAD_STEPS:
-            where = f"(step {self.step}, frames {', '.join(self.task.frame_names(inputs))})"
-            hint = "lower the learning rate or check these frames; the last checkpoint is valid."
-            raise AvatarError(f"loss: not finite for {self.bad_steps} steps in a row {where}. Hint: {hint}")
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -204,24 +198,14 @@ class Trainer:
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
-        state = {
-            "format": FORMAT,
-            "model": self.model.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "step": self.step,
-            "stage": self.stage,
-            "seconds": self.seconds,
-            "random": gather(random, self.world),
-            "threads": torch.get_num_threads(),
-        }
+        state = {"format": FORMAT, "model": self.model.state_dict(), "optimiser": self.optimiser.state_dict()}
+        state |= {"step": self.step, "stage": self.stage, "seconds": self.seconds}
+        state |= {"random": gather(random, self.world), "threads": torch.get_num_threads()}
         if self.world.is_main:
             save_checkpoint(self.folder / "checkpoints", state, self.step, score)
 
     def resume(self) -> None:
-        """Goes back to the newest valid checkpoint; seeds the random state when there is none.
-
-        Raises `DataError` for a checkpoint of an earlier version's trainer, or of another run.
-        """
+        """Goes back to the newest valid checkpoint, else seeds the random state; `DataError` for one of another run."""
         world, folder = self.world, self.folder / "checkpoints"
         state = broadcast(load_checkpoint(folder) if world.is_main else None, world)
         torch.manual_seed(self.budget.seed + SEED_STRIDE * world.rank)
@@ -250,3 +234,88 @@ def spent(budget: Budget, steps: int, seconds: float) -> float:
     """Share of a budget that steps and seconds of training have used, by whichever is further."""
     clock = seconds / (60 * budget.minutes) if budget.minutes else 0.0
     return max(steps / budget.steps, clock)
+
+
+class Feed:
+    """The inputs of training steps on a device: while a step trains there, a thread prepares those of the next one.
+
+    Used as a ``with`` block, at whose end nothing goes on in the background. For CUDA they are copied from pinned
+    memory. On the CPU they are prepared on request: a thread with work of its own would have OpenMP threads of its own,
+    and OpenMP then lets all of them sleep at once (docs/performance.md).
+    """
+
+    def __init__(self, make: Callable[[int], Inputs], steps: int, device: torch.device):
+        """Prepares nothing yet; ``make`` gives the inputs of a step, by one call at a time, at most one step ahead."""
+        self.make, self.steps, self.device = make, steps, device
+        self.pinned = device.type == "cuda"
+        options = {"initializer": torch.cuda.set_device, "initargs": (device,)} if self.pinned else {}
+        self.thread = ThreadPoolExecutor(1, "feed", **options) if device.type != "cpu" else None
+        self.ahead: dict[int, Future[Inputs]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.thread:
+            self.thread.shutdown(cancel_futures=True)
+
+    def __call__(self, step: int) -> Inputs:
+        """The inputs of a step, on the device. What `make` raises for a step is raised here, at that step."""
+        if not self.thread:
+            return to_device(self.make(step), self.device)
+        ready = self.ahead.pop(step, None) or self.thread.submit(self._prepare, step)
+        records = ready.result()
+        self.ahead = {step + 1: self.thread.submit(self._prepare, step + 1)} if step + 1 < self.steps else {}
+        return to_device(records, self.device)
+
+    def _prepare(self, step: int) -> Inputs:
+        records = self.make(step)
+        return tuple(map_tensors(record, Tensor.pin_memory) for record in records) if self.pinned else records
+
+
+def to_device(records: Inputs, device: torch.device) -> Inputs:
+    """Inputs with their tensors on a device; from pinned memory without waiting for the copy."""
+    return tuple(map_tensors(record, lambda tensor: tensor.to(device, non_blocking=True)) for record in records)
+
+
+class TrainingLog:
+    """Rows of ``metrics.csv``, and of TensorBoard where it is installed: split, step, epoch, seconds and every term."""
+
+    def __init__(self, folder: Path, columns: list[str], from_step: int):
+        """Begins the log of a run, or drops rows past the step a resumed run starts from; `DataError` if it cannot."""
+        self.path = folder / "metrics.csv"
+        self.columns = ["split", "step", "epoch", "seconds", *columns]
+        kept = [row for row in read_log(self.path) if int(row["step"]) <= from_step] if self.path.is_file() else []
+        header = dict(zip(self.columns, self.columns))
+        write_whole(self.path, self.as_text(header, *kept).encode())
+        self.board = None
+        with suppress(AvatarError):
+            require("tensorboard")
+            self.board = require("torch.utils.tensorboard").SummaryWriter(folder / "tensorboard")
+
+    def as_text(self, *rows: dict[str, str]) -> str:
+        """Rows as lines of the file."""
+        text = io.StringIO(newline="")
+        csv.DictWriter(text, self.columns, restval="", extrasaction="ignore").writerows(rows)
+        return text.getvalue()
+
+    def write(self, split: str, step: int, epoch: int, seconds: float, values: dict[str, float]) -> None:
+        """Writes one row, of values there are. Raises `DataError` when the disk refuses."""
+        if not values:
+            return
+        row = {"split": split, "step": step, "epoch": epoch, "seconds": f"{seconds:.2f}"}
+        try:
+            with self.path.open("a", newline="") as file:
+                file.write(self.as_text(row | {name: f"{value:.6g}" for name, value in values.items()}))
+        except OSError as error:
+            hint = "Make room and give the same command again."
+            raise DataError(self.path, f"could not be written ({error.strerror}).", hint) from error
+        for name, value in values.items() if self.board else ():
+            self.board.add_scalar(f"{split}/{name}", value, step)
+
+
+def read_log(path: Path) -> list[dict[str, str]]:
+    """The whole rows of a training log; what a killed run left half-written is passed over."""
+    text = path.read_text(errors="replace")
+    rows = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+    return [row for row in rows if str(row.get("step")).isdigit() and None not in (*row, *row.values())]

@@ -107,13 +107,13 @@ def test_chunked_search_carries_nan_through_with_indices_in_range():
 
 
 def test_counts_and_shapes_are_checked():
-    with pytest.raises(AvatarError, match="k=6 points or more, got 5"):
+    with pytest.raises(AvatarError, match="k of 1 to the 5 points, got 6"):
         k_nearest(cloud(1, 5, 0), cloud(1, 5, 1), 6)
-    with pytest.raises(AvatarError, match="at least 1"):
+    with pytest.raises(AvatarError, match="k of 1 to the 5 points, got 0"):
         k_nearest(cloud(1, 5, 0), cloud(1, 5, 1), 0)
     with pytest.raises(AvatarError, match="B=1"):
         nearest(cloud(1, 5, 0), cloud(2, 5, 1))
-    with pytest.raises(AvatarError, match="k=1"):
+    with pytest.raises(AvatarError, match="k of 1 to the 0 points, got 1"):
         nearest(cloud(1, 5, 0), torch.zeros(1, 0, 3))
 
 

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from avatar.checks import AvatarError
-from avatar.implicit.networks import MlpConfig, PosedSdf, SdfConfig, SkipMlp, fourier_features
+from avatar.geometry.transforms import fourier_features
+from avatar.implicit.networks import MlpConfig, PosedSdf, SdfConfig, SkipMlp
 
 BOX = torch.tensor([[-0.9, -1.0, -0.4], [1.1, 0.8, 0.4]])
 SMALL = {"widths": (64, 64, 64, 64), "skip": 2, "orders": 4}

@@ -94,7 +94,7 @@ def test_the_code_that_counts_is_what_a_program_loads_to_run_it():
     ("module", "counts"),
     [
         ("avatar.evaluation.metrics", True),
-        ("avatar.geometry.distances", True),  # which metrics import
+        ("avatar.geometry.neighbours", True),  # which metrics import
         ("avatar.data.scanner", True),
         ("avatar.evaluation.plots", False),
         ("avatar.training.trainer", False),

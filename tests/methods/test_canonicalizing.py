@@ -12,10 +12,9 @@ from limbs import arm_frame, arm_template, legs_template, skirt_frame
 import avatar.methods.canonicalizer as cycles
 from avatar.body.packed import read_template
 from avatar.body.skinning import skin_transforms
-from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
+from avatar.canonical.canonicalizer import TERMS, Canonicalizer, CanonicalizerConfig, Latent, cycle_loss
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.losses import TERMS, canonicalization_loss
-from avatar.canonical.posed import DrawConfig, prepare_scan, to_root_frame
+from avatar.canonical.scans import DrawConfig, prepare_scan, to_root_frame
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset
 from avatar.data.scanner import ScanConfig
@@ -36,8 +35,7 @@ from avatar.methods.canonicalizer import (
 )
 from avatar.pipeline.canonicalization import canonicalize, canonicalizer_with, score_canonical_scans, weight_colors
 from avatar.runs.canonicalizing import canonicalize_frames, skinning_source, train_canonicalizer
-from avatar.training.logs import read_log
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import Trainer, read_log
 
 TEMPLATE = arm_template()
 NETS = CanonicalizerConfig(SkinningFieldConfig(width=32, orders=4), SkinningFieldConfig(width=32, orders=4, latent=4))
@@ -133,9 +131,9 @@ def test_each_stage_follows_its_own_schedule(tmp_path, monkeypatch):
 
     def watch(cycle, batch, template, config, progress):
         seen.append((trainer.optimiser.param_groups[0]["lr"], cycle.reposed is not None, progress))
-        return canonicalization_loss(cycle, batch, template, config, progress)
+        return cycle_loss(cycle, batch, template, config, progress)
 
-    monkeypatch.setattr(cycles, "canonicalization_loss", watch)
+    monkeypatch.setattr(cycles, "cycle_loss", watch)
     drawn = []
     for trainer.step in range(12):
         drawn.append(trainer.task.inputs_at(trainer.step)[0].points[:, 0])
@@ -168,7 +166,7 @@ def test_a_code_is_found_at_its_own_falling_rate_from_new_points_every_step(monk
         seen.append((batch.points[0, 0], progress))
         return SimpleNamespace(total=cycle.codes.sum())
 
-    monkeypatch.setattr(cycles, "canonicalization_loss", steady)
+    monkeypatch.setattr(cycles, "cycle_loss", steady)
     config = CycleConfig(code_steps=4, code_lr=0.01, draw=DRAW)
     found = fit_latent(model, TEMPLATE, SCANS[2], model.codes[0], config)
     expected = model.codes[0] - 0.01 * (1 + 1 + 0.1 + 0.01)  # Adam under a constant gradient moves by the rate

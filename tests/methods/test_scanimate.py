@@ -7,7 +7,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from avatar.canonical.scans import NearestBody, canonicalize_scan
+from avatar.canonical.fields import BodyField
+from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError, DataError
 from avatar.data.canonical_frames import CanonicalFrames, canonical_frame
 from avatar.data.splits import SplitConfig
@@ -27,8 +28,7 @@ from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_to_dict
 from avatar.simulate.sequences import authored_motion
-from avatar.training.logs import read_log
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import Trainer, read_log
 
 SETTINGS = {
     "avatar": {
@@ -37,7 +37,7 @@ SETTINGS = {
         "gate_spacing": 0.06,
     },
     "train": {
-        "probes": {"near_points": 300, "box_points": 100, "rim_points": 60, "near_distance": 0.05},
+        "queries": {"near_points": 300, "box_points": 100, "boundary_points": 60, "near_distance": 0.05},
         "loss": {"surface": 10.0},
         "decay_at": [],
     },
@@ -58,7 +58,7 @@ def settings(tiny_folder, tiny_outfit, tmp_path_factory) -> RunConfig:
     runs = tmp_path_factory.mktemp("runs")
     where = {"dataset": tiny_folder.parent.name, "data_root": tiny_folder.parents[1], "runs_root": runs}
     folder = train_canonicalizer(CanonicalizeConfig(outfit=tiny_folder.name, weights=WeightSource.knn, **where))
-    source = NearestBody(tiny_outfit.template, 6)
+    source = BodyField(tiny_outfit.template, 6)
     for name in tiny_outfit.frames("train"):
         frame = tiny_outfit.load("train", name)
         weights = source.weights_of(frame.scan.points, frame)
@@ -161,8 +161,8 @@ def make_trainer(trained, tiny_outfit, tmp_path, frames):
     def make(settings: ImplicitTrainConfig | None = None, **options) -> Trainer:
         avatar = load_avatar(trained)
         train = replace(avatar.config.train, schedule=Schedule.constant, **options)
-        probes = QueryConfig(near_points=60, box_points=20, rim_points=20)
-        settings = replace(settings or ImplicitTrainConfig(), probes=probes)
+        queries = QueryConfig(near_points=60, box_points=20, boundary_points=20)
+        settings = replace(settings or ImplicitTrainConfig(), queries=queries)
         data = CanonicalFrames(frames, 50, seed=3)
         task = ImplicitTask(avatar.model, tiny_outfit.template.vertices, train, settings, data)
         return Trainer(task, train, tmp_path)

@@ -28,7 +28,7 @@ from avatar.pipeline.experiments import ExperimentConfig, experiment, tabulate_e
 ROOT = Path(__file__).parents[2]
 METRICS = ("cd_point", "normal_l1")
 IMPLICIT = {"avatar": {"sdf": {"widths": [24, 24, 24], "skip": 1, "orders": 4}, "gate_spacing": 0.1}}
-IMPLICIT["train"] = {"probes": {"near_points": 100, "box_points": 50, "rim_points": 30}, "decay_at": []}
+IMPLICIT["train"] = {"queries": {"near_points": 100, "box_points": 50, "boundary_points": 30}, "decay_at": []}
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from avatar.training import feeding
-from avatar.training.feeding import Feed
+from avatar.training import trainer
+from avatar.training.trainer import Feed
 
 CPU = torch.device("cpu")
 
@@ -28,7 +28,7 @@ def numbers(step: int) -> tuple[Numbers, Numbers]:
 @pytest.fixture
 def elsewhere(monkeypatch) -> torch.device:
     """A device that is not the CPU, whose tensors stay where they are."""
-    monkeypatch.setattr(feeding, "to_device", lambda records, device: records)
+    monkeypatch.setattr(trainer, "to_device", lambda records, device: records)
     return torch.device("meta")
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig
-from avatar.canonical.posed import prepare_scan
+from avatar.canonical.scans import prepare_scan
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
 from avatar.implicit.networks import PosedSdf, SdfConfig
@@ -22,8 +22,7 @@ from avatar.simulate.dressing import TravelConfig
 from avatar.simulate.outfits import outfit
 from avatar.simulate.poses import draw_poses
 from avatar.simulate.production import dress
-from avatar.training.feeding import to_device
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import Trainer, to_device
 from benchmarks.avatars import sample_outfit
 from benchmarks.comparisons import Comparison, Job, Run, absence
 
@@ -66,7 +65,7 @@ def extraction_comparisons(job: Job) -> list[Comparison]:
         def field(points: Tensor) -> Tensor:
             return sdf(points[None], points.new_zeros(1, len(points), 0))[0]
 
-        return lambda: extract_surface(field, box, config).mesh
+        return lambda: extract_surface(field, box, config)
 
     def gap(mine: Mesh, baseline: Mesh) -> float:
         same = mine.vertices.shape == baseline.vertices.shape
