@@ -1,4 +1,4 @@
-"""Canonicalizations scored against the truth, which only a simulator knows: where on the garment a scan point really is.
+"""Canonicalizations scored against the truth, which only a simulator knows: where a scan point is at rest.
 
 What the cloth itself does between the two poses is in the error as well, the same for every method. A reference says
 how much: each point unposed with the weights of the body under its true place.
@@ -62,7 +62,7 @@ class FrameTruth:
 
 
 def check_truth(scan: Scan) -> None:
-    """Refuses a scan without labels and canonical positions, by an `AvatarError`: where do its points belong at rest?"""
+    """Refuses, by an `AvatarError`, a scan that does not know where its points belong at rest."""
     if scan.canonical is None or scan.labels is None:
         raise AvatarError("scan: expected labels and canonical positions; only simulated data has the truth.")
 
@@ -251,10 +251,10 @@ def score_canonicalization(
 ) -> Scores:
     """Every metric of some frames for several canonicalizations, and for the true weights beside them.
 
-    ``methods`` are labels and what each makes of a frame as the simulated outfit loads it; the truth of a frame is found
-    once for all. Metrics that a frame does not have (no contact, no triangles) are left out of the means. With a ledger
-    only new or changed values are measured; ``made_by`` is then a hash of all that each method's canonical scans depend
-    on but the data. Raises `AvatarError` naming the frame, for data without truth or a scan that is not the frame's.
+    ``methods`` are labels and what each makes of a frame as the simulated outfit loads it. Metrics that a frame has not
+    (no contact, no triangles) are left out of the means. With a ledger only new or changed values are measured;
+    ``made_by`` is then a hash of all that each method's canonical scans depend on but the data. Raises `AvatarError`
+    naming the frame, for data without truth or a scan that is not the frame's.
     """
     if not methods or not names:
         raise AvatarError(f"methods, names: expected at least one each, got {len(methods)} and {len(names)}.")

@@ -131,8 +131,8 @@ def score_predictions(
 ) -> Scores:
     """Scores a folder of predictions, ``<frame>.ply`` with normals for every frame of a split of an outfit.
 
-    Files that belong to no frame are ignored with a warning. ``meshes`` is a folder of predicted meshes, ``<frame>.ply``
-    or ``.obj``, which s2m_cm and normal_consistency then measure instead of the points. ``ledger`` keeps values, so that
+    Files that belong to no frame are ignored with a warning. ``meshes`` is a folder of predicted meshes, ``.ply`` or
+    ``.obj``, which s2m_cm and normal_consistency then measure instead of the points. ``ledger`` keeps values, so that
     only new or changed ones are measured; None measures all. Penetration is scored where the outfit has a template.
 
     Raises `DataError` when frames have no prediction (naming them) or one is in other units than its scan, and

@@ -135,7 +135,7 @@ def _pseudo_normals(mesh: trimesh.Trimesh, face_ids: np.ndarray, weights: np.nda
 
 
 def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Whether each face ``(F, 3)`` of ``vertices (V, 3)`` cuts through one that shares no vertex with it, ``(F,)`` bool.
+    """Whether each face ``(F, 3)`` of a mesh ``(V, 3)`` cuts through one that shares no vertex with it, ``(F,)`` bool.
 
     An edge that passes through a triangle is a crossing; triangles in one plane are not.
     """
@@ -192,7 +192,7 @@ def view_axes() -> Tensor:
 
 
 def render_normals(points: Tensor, normals: Tensor, radius: float, center: Tensor, extent: float) -> Tensor:
-    """Normal maps of a cloud's discs under an orthographic camera, ``(6, PIXELS, PIXELS, 3)``, zero where nothing is seen.
+    """Orthographic normal maps of a cloud's discs, ``(6, PIXELS, PIXELS, 3)``, zero where nothing is seen.
 
     ``points`` and unit ``normals (N, 3)`` float64; the discs' ``radius``, the views' ``center (3,)`` and their
     ``extent`` from side to side in metres. A disc is drawn as a flat cone, so that of discs that overlap on one surface

@@ -306,7 +306,8 @@ def budget_table(rows: Sequence[Score]) -> Table:
     trained = grouped((row for row in rows if row.steps), method_key)
     body, steps, minutes = [], set(), []
     for method in aggregate.order_methods(trained):
-        counts, times = zip(*{(row.outfit, row.seed): (row.steps, row.seconds / 60) for row in trained[method]}.values())
+        runs = {(row.outfit, row.seed): (row.steps, row.seconds / 60) for row in trained[method]}
+        counts, times = zip(*runs.values())
         steps.update(counts)
         minutes += times
         mean = float(np.mean(counts)), float(np.mean(times))

@@ -12,21 +12,19 @@ import yaml
 
 from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.layouts import find_outfit
-from avatar.data.outfits import SPLITS, Outfit
+from avatar.data.outfits import SPLITS
 from avatar.data.scanner import ScanConfig
 from avatar.environment import prepared_process
-from avatar.evaluation.aggregate import FLOORS, by_split, method_key, named, order_methods
-from avatar.evaluation.canonical_scores import canonical_overview, canonical_table
-from avatar.evaluation.differences import budget_table, compare_methods, difference_table, differences_csv
-from avatar.evaluation.forms import Axis, FormConfig, ReportedTable, form_table, reported_table
+from avatar.evaluation import aggregate, plots, tables
+from avatar.evaluation.aggregate import FLOORS, method_key
+from avatar.evaluation.canonical import OVERVIEW, canonical_table
 from avatar.evaluation.metrics import find_metrics
-from avatar.evaluation.plots import plot_fractions, plot_outfits, plot_progress, plot_times, save_figure
 from avatar.evaluation.scores import Score, Scores, read_scores, write_scores
-from avatar.evaluation.tables import Table, View, outfit_table, to_latex, to_markdown
+from avatar.evaluation.tables import Axis, FormConfig, ReportedTable, Table, View, form_table, outfit_table
 from avatar.export.pictures import contact_sheet, frame_camera, render_points, save_picture
 from avatar.io.npz import write_whole
 from avatar.io.points import read_points
-from avatar.pipeline.scores import are_current, predictions_folder, read_all_scores, read_floors, scores_file
+from avatar.pipeline.scores import are_current, predictions_folder, read_floors, scores_file
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
 from avatar.records import PointCloud, Scan
@@ -84,13 +82,13 @@ def compare(config: CompareConfig) -> Path:
     Raises:
         AvatarError: when nothing was scored, or when outfits of one name in two data sets would share a row.
     """
-    tables, pictures = [], []
+    found, pictures = [], []
     if config.runs or not config.canonicalizers:
-        tables, pictures = compare_runs(config, config.runs or tuple(named_runs(config)))
-    tables += canonical_tables(config)
-    text = "\n".join([*map(to_markdown, tables), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
+        found, pictures = compare_runs(config, config.runs or tuple(named_runs(config)))
+    found += canonical_tables(config)
+    text = "\n".join([*map(tables.to_markdown, found), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
     write_whole(file_of(config, "md"), text.encode())
-    write_whole(file_of(config, "tex"), "\n".join(map(to_latex, tables)).encode())
+    write_whole(file_of(config, "tex"), "\n".join(map(tables.to_latex, found)).encode())
     print(f"{text}\nwritten: {file_of(config, '*')}")
     return file_of(config, "md")
 
@@ -99,17 +97,23 @@ def compare_runs(config: CompareConfig, runs: tuple[Path, ...]) -> tuple[list[Ta
     """The tables of runs and their pictures, which are written, as are the scores."""
     scores = gather_scores(config, runs)
     write_scores(file_of(config, "csv"), scores)
-    scores, shared = without_shared_variant(scores)
+    variants = {row.variant for row in scores.rows if row.method not in FLOORS[:2]}
+    shared = variants.pop() if len(variants) == 1 else ""  # of all trained methods: it tells nothing apart
+    scores = Scores(
+        *(
+            [replace(row, variant=row.variant if row.variant != shared else "") for row in mine]
+            for mine in (scores.rows, scores.frames)
+        )
+    )
     splits = list(dict.fromkeys(row.split for row in scores.rows))
-    tables = [*main_tables(config, scores.rows, splits), *side_tables(config, scores, splits)]
-    tables[0] = replace(tables[0], notes=(*tables[0].notes, *([f"All methods: {shared}."] if shared else [])))
-    if config.reported is not None:
-        tables.append(reported_table(config.reported))
-    pictures = [*save_plots(config, scores.of_split(splits[0]).rows, runs)]
-    if config.pictures:
-        grid = file_of(config, "poses.jpg")
-        pictures += [grid] if draw_pose_grid(grid, runs, config.pictures, config.splits[0], config.data_root) else []
-    return tables, pictures
+    found = [*main_tables(config, scores.rows, splits), *side_tables(config, scores, splits)]
+    found[0] = replace(found[0], notes=(*found[0].notes, *([f"All methods: {shared}."] if shared else [])))
+    found += [] if config.reported is None else [tables.reported_table(config.reported)]
+    pictures = [*save_plots(config, scores.only("split", splits[:1]).rows, runs)]
+    grid = file_of(config, "poses.jpg")
+    if config.pictures and draw_pose_grid(config, grid, runs):
+        pictures.append(grid)
+    return found, pictures
 
 
 def file_of(config: CompareConfig, suffix: str) -> Path:
@@ -131,40 +135,27 @@ def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
     Raises:
         AvatarError: when there are none, or outfits of one name come from several data sets.
     """
-    scores, datasets = Scores(), {}
     files = [scores_file(run, split) for run in runs for split in config.splits]
     if old := [str(path) for path in files if path.is_file() and not are_current(path)]:
         log.warning("compare: scored by other code than today's, or edited: %s. Score them again.", ", ".join(old))
+    scores, datasets, floors = Scores(), {}, Scores()
     for run in runs:
-        mine = read_all_scores(scores_file(run, split) for split in config.splits)
+        mine = read_scores(*(scores_file(run, split) for split in config.splits))
         for row in mine.rows:
             datasets.setdefault(row.outfit, set()).add(row.dataset or dataset_of(run))
-        scores = scores + mine
+        scores += mine
     if not scores.rows:
         raise AvatarError(f"runs_root: no scores below {config.runs_root}. Run tools/evaluate.py first.")
-    for outfit, found in datasets.items():
+    for outfit, found in sorted(datasets.items()):
         if len(found) > 1:
             raise AvatarError(
                 f"runs: outfit {outfit!r} is in several data sets ({', '.join(sorted(found))}) and would share a row. "
                 "Compare one data set at a time."
             )
-    floors = Scores()
-    for outfit, (dataset,) in sorted(datasets.items()):
         for split in set(config.splits) & set(SPLITS):
-            floors = floors + read_floors(config.runs_root, dataset, outfit, scores.rows, split)
+            floors += read_floors(config.runs_root, *found, outfit, scores.rows, split)
     whole = floors + scores
     return Scores([replace(row, table=config.table) for row in whole.rows], whole.frames)
-
-
-def without_shared_variant(scores: Scores) -> tuple[Scores, str]:
-    """The scores without a variant that all trained methods share, and that variant: it tells nothing apart."""
-    variants = {row.variant for row in scores.rows if row.method not in FLOORS[:2]}
-    shared = variants.pop() if len(variants) == 1 else ""
-    rows, frames = (
-        [replace(row, variant="") if row.variant == shared else row for row in mine]
-        for mine in (scores.rows, scores.frames)
-    )
-    return Scores(rows, frames), shared
 
 
 def dataset_of(run: Path) -> str:
@@ -181,69 +172,60 @@ def main_tables(config: CompareConfig, rows: list[Score], splits: list[str]) -> 
     A form has all splits as outfits of their own and then no summary over outfits; else each split has its tables.
     """
     if config.form is None and len(splits) > 1:
-        tables = []
-        for split in splits:
-            mine = main_tables(config, [row for row in rows if row.split == split], [split])
-            tables += [replace(table, title=f"{split}: {table.title}") for table in mine]
-        return tables
+        found = {split: main_tables(config, [row for row in rows if row.split == split], [split]) for split in splits}
+        return [replace(table, title=f"{split}: {table.title}") for split, mine in found.items() for table in mine]
     metrics = [name for name in config.metrics if name in {row.metric for row in rows}]
-    if config.form is not None:
-        form = config.form if len(splits) == 1 else split_form(config.form)
-        rows = by_split(rows)
-        tables = [form_table(rows, metrics, form, config.table)]
-        distances = [name for name in metrics if name.startswith("cd_")]
-        if distances and any(row.method == "sampling" for row in rows):
-            title = f"{config.table}, excess over the sampling floor"
-            tables.append(form_table(rows, distances, form, title, excess=True))
-        return tables
-    tables = [outfit_table(rows, metric) for metric in metrics]
     methods = {row.method for row in rows}
+    if config.form is not None:
+        form, rows = config.form, aggregate.by_split(rows)
+        if len(splits) > 1:  # outfits stand in it, and no mean or worst of all rows
+            down = form.rows if Axis.outfit in (*form.rows, *form.columns) else (Axis.outfit, *form.rows)
+            form = replace(form, rows=down, outfits=True, summary=False)
+        found, distances = [form_table(rows, metrics, form, config.table)], [m for m in metrics if m.startswith("cd_")]
+        if distances and "sampling" in methods:
+            title = f"{config.table}, excess over the sampling floor"
+            found.append(form_table(rows, distances, form, title, excess=True))
+        return found
+    views = [(metric, View.VALUE) for metric in metrics]
     if {"sampling", "body"} <= methods and "cd_point" in metrics:
-        tables += [outfit_table(rows, "cd_point", View.EXCESS), outfit_table(rows, "cd_point", View.OF_BODY)]
-        tables += [outfit_table(rows, "cd_point", View.OF_STATIC)] if "static" in methods else []
-    return tables
-
-
-def split_form(form: FormConfig) -> FormConfig:
-    """A form for several splits: outfits stand in it, and no mean or worst of all rows."""
-    rows = form.rows if Axis.outfit in (*form.rows, *form.columns) else (Axis.outfit, *form.rows)
-    return replace(form, rows=rows, outfits=True, summary=False)
+        views += [("cd_point", View.EXCESS), ("cd_point", View.OF_BODY)]
+        views += [("cd_point", View.OF_STATIC)] if "static" in methods else []
+    return [outfit_table(rows, metric, view) for metric, view in views]
 
 
 def side_tables(config: CompareConfig, scores: Scores, splits: list[str]) -> list[Table]:
     """What training cost, and differences to the baseline on each split, which are written as CSV too."""
-    tables = [budget_table(scores.rows)]
-    if config.baseline:
-        scored = {row.metric for row in scores.frames if row.method not in FLOORS[:2]}  # floors may have more
-        metrics = [name for name in config.metrics if name in scored]
-        how = (config.baseline, config.resamples, config.confidence)
-        found = [
-            replace(difference, outfit=named(difference.outfit, *({split} - {"test"})))
-            for metric in metrics
-            for split in splits
-            for difference in compare_methods(scores.of_split(split), metric, *how)
-        ]
-        write_whole(file_of(config, "differences.csv"), differences_csv(found).encode())
-        tables += [difference_table(found, metric) for metric in metrics]
-    return tables
+    if not config.baseline:
+        return [tables.budget_table(scores.rows)]
+    scored = {row.metric for row in scores.frames if row.method not in FLOORS[:2]}  # floors may have more
+    metrics = [name for name in config.metrics if name in scored]
+    found = [
+        difference._replace(outfit=aggregate.named(difference.outfit, *({split} - {"test"})))
+        for metric in metrics
+        for split in splits
+        for difference in aggregate.compare_methods(
+            scores.only("split", [split]), metric, config.baseline, config.resamples, config.confidence
+        )
+    ]
+    write_whole(file_of(config, "differences.csv"), aggregate.differences_csv(found).encode())
+    return [tables.budget_table(scores.rows), *(tables.difference_table(found, metric) for metric in metrics)]
 
 
 def canonical_tables(config: CompareConfig) -> list[Table]:
     """Canonical scans against their truth: an overview a split where there are several outfits, a table an outfit."""
     if not config.canonicalizers:
         return []
-    scores = read_all_scores(folder / "scores.csv" for folder in config.canonicalizers)
+    scores = read_scores(*(folder / "scores.csv" for folder in config.canonicalizers))
     write_scores(file_of(config, "canonical.csv"), scores)
-    rows = scores.rows
-    tables, single = [], []
-    for split in dict.fromkeys(row.variant for row in rows if row.variant):
+    overviews, single = [], []
+    for split in dict.fromkeys(row.variant for row in scores.rows if row.variant):
         title = f"canonical scans of {split} frames"
-        mine = [replace(row, variant="") for row in rows if row.variant == split]
+        mine = [replace(row, variant="") for row in scores.rows if row.variant == split]
         outfits = list(dict.fromkeys(row.outfit for row in mine))
         if len(outfits) > 1:
-            tables.append(replace(canonical_overview(mine), title=title))
-        single += [replace(canonical_table(mine, outfit), title=f"{outfit}: {title}") for outfit in outfits]
-    return tables + single
+            overviews.append(replace(canonical_table(mine, outfits, OVERVIEW), title=title))
+        single += [replace(canonical_table(mine, [name]), title=f"{name}: {title}") for name in outfits]
+    return overviews + single
 
 
 def save_plots(config: CompareConfig, rows: list[Score], runs: tuple[Path, ...]) -> Iterator[Path]:
@@ -251,37 +233,28 @@ def save_plots(config: CompareConfig, rows: list[Score], runs: tuple[Path, ...])
     metric = next((name for name in config.metrics if name in {row.metric for row in rows}), None)
     if not config.plots or metric is None:
         return
-    figures = {"outfits": plot_outfits(rows, metric), "times": plot_times(rows, metric)}
+    figures = {"outfits": plots.plot_outfits(rows, metric), "times": plots.plot_times(rows, metric)}
     if len({row.fraction for row in rows if row.method not in FLOORS}) > 1:
-        figures["fractions"] = plot_fractions(rows, metric)
+        figures["fractions"] = plots.plot_fractions(rows, metric)
     logs: dict[str, dict[str, Path]] = {}
     for run in runs:
         if (run / "metrics.csv").is_file():
             first = read_scores(run / "scores.csv").rows[0]
             logs.setdefault(run.parent.name, {})[method_key(first)] = run / "metrics.csv"
     if logs:
-        figures["progress"] = plot_progress(logs)
+        figures["progress"] = plots.plot_progress(logs)
     for name, figure in figures.items():
-        save_figure(figure, file_of(config, f"{name}.png"))
+        plots.save_figure(figure, file_of(config, f"{name}.png"))
         yield file_of(config, f"{name}.png")
 
 
-def draw_pose_grid(path: Path, runs: Sequence[Path], count: int, split: str, data_root: Path | None = None) -> bool:
+def draw_pose_grid(config: CompareConfig, path: Path, runs: Sequence[Path]) -> bool:
     """Writes the same unseen poses by all methods beside the ground truth, as in CloSET's figure 4.
 
-    Rows are ``count`` evenly spaced poses of every outfit, columns the methods and the truth.
-
-    Args:
-        path: the picture.
-        runs: folders of runs or of scored foreign predictions; what has no predictions of the split is left empty.
-        count: poses an outfit.
-        split: which of the predictions.
-        data_root: where the data are now; where they were at training if None.
-
-    Returns:
-        Whether there were any predictions to draw.
+    Rows are evenly spaced poses of every outfit, columns the methods, empty where there are no predictions of the
+    split, and the truth. Says whether there were any predictions to draw.
     """
-    outfits: dict[str, Outfit] = {}
+    split, outfits = config.splits[0], {}
     folders: dict[str, dict[str, Path]] = {}  # of predictions, by outfit and method
     for run in runs:
         settings = yaml.safe_load((run / "config.yaml").read_text()) if (run / "config.yaml").is_file() else {}
@@ -291,13 +264,14 @@ def draw_pose_grid(path: Path, runs: Sequence[Path], count: int, split: str, dat
                 continue
             folders.setdefault(name, {})[method_key(row)] = folder
             if name not in outfits:
-                root = data_root or Path(settings.get("data_root", "data"))
+                root = config.data_root or Path(settings.get("data_root", "data"))
                 scan = settings_from_dict(ScanConfig, settings.get("scan", {}))
                 outfits[name] = find_outfit(root, row.dataset or str(settings.get("dataset", "sample")), name, scan)
-    methods = order_methods({method for mine in folders.values() for method in mine})
+    methods = aggregate.order_methods({method for mine in folders.values() for method in mine})
     rows, labels = [], []
     for name, outfit in outfits.items():
-        for frame in tracked(spaced_frames(list(outfit.frames(split)), count), f"pictures of {name}", unit="picture"):
+        names = spaced_frames(list(outfit.frames(split)), config.pictures)
+        for frame in tracked(names, f"pictures of {name}", unit="picture"):
             paths = [folders[name][method] / f"{frame}.ply" if method in folders[name] else None for method in methods]
             rows.append(draw_pose(outfit.load(split, frame).scan, paths))
             labels.append(f"{name}: {frame}" if len(outfits) > 1 else frame)

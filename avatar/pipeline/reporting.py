@@ -7,26 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.data.outfits import Outfit
+from avatar.data.outfits import SPLITS, VALIDATION, Outfit
 from avatar.environment import prepared_process
+from avatar.evaluation.aggregate import by_split
 from avatar.evaluation.report import COLUMNS, Picture, PictureRow, ReportContent, write_report
-from avatar.evaluation.scores import Scores
-from avatar.evaluation.tables import View, metric_table, outfit_table
-from avatar.export.pictures import (
-    Camera,
-    color_bar,
-    contact_sheet,
-    frame_camera,
-    render_error,
-    render_mesh,
-    render_points,
-    save_picture,
-)
+from avatar.evaluation.scores import Scores, read_scores
+from avatar.export import pictures
 from avatar.geometry.trees import build_tree
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.methods.base import TrainedAvatar
-from avatar.pipeline.scores import floors_root, predictions_folder, read_all_scores, read_floors, run_outfits
+from avatar.pipeline import scores
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.records import PointCloud
 from avatar.runs.training import load_avatar
@@ -40,7 +31,7 @@ class ReportConfig:
 
     run: Path = Path("runs/closet/sample/dress/default")
     against: tuple[Path, ...] = ()  # other runs whose scores stand in the same table, such as the static floor
-    split: str = "test"
+    split: str = "test"  # whose poses are shown; scores are those of every split
     frames: int = 4  # poses shown
     data_root: Path | None = None  # where the data are now; where they were at training if null
 
@@ -52,25 +43,21 @@ def report(config: ReportConfig) -> Path:
     What has not been predicted, meshed or scored is said to be missing on the page.
     """
     avatar = load_avatar(config.run)
-    scores = gather_scores(config, avatar)
-    rows: list[PictureRow] = []
-    for outfit in run_outfits(avatar, config.data_root):
+    found, rows, settings = gather_scores(config, avatar), [], avatar.config
+    for outfit in scores.run_outfits(avatar, config.data_root):
         names = spaced_frames(list(outfit.frames(config.split)), config.frames)
         rows += [pose_pictures(config, avatar, outfit, name) for name in names]
         rows += template_pictures(avatar, outfit)
-    save_picture(config.run / "pictures.png", picture_sheet(rows))
-    tables = [metric_table(scores.rows, name) for name in dict.fromkeys(row.outfit for row in scores.rows)]
-    if "sampling" in {row.method for row in scores.rows}:
-        tables.append(outfit_table(scores.rows, "cd_point", View.EXCESS))
-    settings = avatar.config
+    pictures.save_picture(config.run / "pictures.png", picture_sheet(rows))
+    seen = "of those trained on" if config.split == "train" else "none of which were trained on"
     content = ReportContent(
         title=f"{settings.method.variant} on {', '.join(settings.outfit)}",
-        subtitle=f"data set {settings.dataset}, {config.split} poses, none of which were trained on",
+        subtitle=f"data set {settings.dataset}, {config.split} poses, {seen}",
         summary="Points are predicted from the posed body alone; ground truth is a scan of the simulated clothes.",
-        facts=headline_facts(avatar, scores),
+        facts=headline_facts(avatar, found),
         config_yaml=(config.run / "config.yaml").read_text(),
         metrics_csv=config.run / "metrics.csv",
-        tables=tuple(tables),
+        tables=tuple(scores.score_tables(found.rows)),
         pictures=tuple(rows),
         files=made_files(config.run),
     )
@@ -78,21 +65,25 @@ def report(config: ReportConfig) -> Path:
 
 
 def gather_scores(config: ReportConfig, avatar: TrainedAvatar) -> Scores:
-    """The run's scores, those of the runs it is set against, and the floors, as far as they are there."""
-    settings, paths = avatar.config, [folder / "scores.csv" for folder in (*config.against, config.run)]
-    scores, root = read_all_scores(path for path in paths if path.is_file()), floors_root(config.run, settings)
-    for name in dict.fromkeys(row.outfit for row in scores.rows):
-        scores = read_floors(root, settings.dataset, name, scores.rows) + scores
-    return scores
+    """The scores on every split of the run and of those it is set against, and the floors, as far as they are there."""
+    settings, found = avatar.config, Scores()
+    root = scores.floors_root(config.run, settings)
+    for split in (*SPLITS, VALIDATION):
+        files = [scores.scores_file(folder, split) for folder in (*config.against, config.run)]
+        mine = read_scores(*filter(Path.is_file, files))
+        for name in dict.fromkeys(row.outfit for row in mine.rows):
+            mine = scores.read_floors(root, settings.dataset, name, mine.rows, split) + mine
+        found += mine
+    return found
 
 
-def headline_facts(avatar: TrainedAvatar, scores: Scores) -> dict[str, str]:
-    """The numbers on top of the page."""
+def headline_facts(avatar: TrainedAvatar, found: Scores) -> dict[str, str]:
+    """The numbers on top of the page: of the test split, or of another where that was not scored."""
     facts = {
         "training": f"{avatar.steps} steps, {avatar.seconds / 60:.1f} min",
         "parameters": f"{sum(p.numel() for p in avatar.model.parameters()):,}",
     }
-    for row in scores.rows:
+    for row in by_split(found.only("split", scores.order_splits(found.rows)[:1]).rows):
         if row.metric == "cd_point":
             facts[f"cd_point, {row.method}, {row.outfit}"] = f"{row.value * 1e4:.3f} x 1e-4 m²"
     return facts
@@ -102,32 +93,32 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
     """Ground truth, prediction, garment template, mesh and error of one unseen pose, in one framing."""
     frame = outfit.load(config.split, name)
     scan = frame.scan
-    camera = frame_camera(scan.points, "three_quarter")
+    camera = pictures.frame_camera(scan.points, "three_quarter")
     truth = draw_cloud(PointCloud(scan.points, scan.normals, scan.colors), camera)
-    pictures = {"ground truth": Picture(truth, f"scan of {name}")}
-    path = predictions_folder(config.run, config.split, outfit.name) / f"{name}.ply"
+    shown = {"ground truth": Picture(truth, f"scan of {name}")}
+    path = scores.predictions_folder(config.run, config.split, outfit.name) / f"{name}.ply"
     if path.is_file():
         cloud = read_points(path)
         errors = build_tree(scan.points).query(cloud.points, workers=-1)[0]
-        hot = render_error(cloud, errors, MAX_ERROR, camera)
-        pictures["prediction"] = Picture(draw_cloud(cloud, camera), f"predicted points for {name}")
-        pictures["error"] = Picture(
-            np.concatenate([hot, color_bar(MAX_ERROR, hot.shape[0])], axis=1),
+        hot = pictures.render_error(cloud, errors, MAX_ERROR, camera)
+        shown["prediction"] = Picture(draw_cloud(cloud, camera), f"predicted points for {name}")
+        shown["error"] = Picture(
+            np.concatenate([hot, pictures.color_bar(MAX_ERROR, hot.shape[0])], axis=1),
             f"distance of predicted points of {name} to the scan",
             f"mean {errors.mean() * 1000:.1f} mm",
         )
     garment = avatar.method.garment(avatar, outfit.name, 50_000, frame.body)
     if garment is not None:
-        pictures["template"] = Picture(render_points(garment, camera), f"garment template posed as {name}")
-    mesh = config.run / "meshes" / config.split / outfit.name / f"{name}.ply"
+        shown["template"] = Picture(pictures.render_points(garment, camera), f"garment template posed as {name}")
+    mesh = scores.meshes_folder(config.run, config.split, outfit.name) / f"{name}.ply"
     if mesh.is_file():
-        pictures["mesh"] = Picture(render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
-    return PictureRow(f"{outfit.name}: {name}", tuple(map(pictures.get, COLUMNS)))
+        shown["mesh"] = Picture(pictures.render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
+    return PictureRow(f"{outfit.name}: {name}", tuple(map(shown.get, COLUMNS)))
 
 
-def draw_cloud(cloud: PointCloud, camera: Camera) -> np.ndarray:
+def draw_cloud(cloud: PointCloud, camera: pictures.Camera) -> np.ndarray:
     """A picture of points in their own colours, where they have some, or by their normals."""
-    return render_points(cloud, camera, "normals" if cloud.colors is None else cloud.colors)
+    return pictures.render_points(cloud, camera, "normals" if cloud.colors is None else cloud.colors)
 
 
 def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
@@ -136,7 +127,7 @@ def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
     blank = np.full_like(shown[0][0].image, 255)
     kept = [column for column in range(len(COLUMNS) - 1) if any(row[column] for row in shown)]
     images = [[row[column].image if row[column] else blank for column in kept] for row in shown]
-    return contact_sheet(images, column_labels=[COLUMNS[column] for column in kept])
+    return pictures.contact_sheet(images, column_labels=[COLUMNS[column] for column in kept])
 
 
 def template_pictures(avatar: TrainedAvatar, outfit: Outfit) -> list[PictureRow]:
@@ -144,8 +135,9 @@ def template_pictures(avatar: TrainedAvatar, outfit: Outfit) -> list[PictureRow]
     cloud = avatar.method.garment(avatar, outfit.name, 50_000)
     if cloud is None:
         return []
-    picture = Picture(render_points(cloud, frame_camera(cloud.points)), f"garment template of {outfit.name}")
-    return [PictureRow(f"{outfit.name}: at rest", (None, None, picture, None, None))]
+    image = pictures.render_points(cloud, pictures.frame_camera(cloud.points))
+    template = Picture(image, f"garment template of {outfit.name}")
+    return [PictureRow(f"{outfit.name}: at rest", (None, None, template, None, None))]
 
 
 def made_files(run: Path) -> tuple[Path, ...]:
