@@ -107,8 +107,8 @@ VERBS = {
     ),
     "demo": Verb(
         "does the main job on the embedded sample",
-        "avatar.pipeline.demo:demo",
-        "avatar.pipeline.demo:DemoConfig",
+        "avatar.pipeline.experiments:demo",
+        "avatar.pipeline.experiments:DemoConfig",
         options="dataset outfit size train.minutes static_share points meshes data_root runs_root device",
     ),
     "parameters": Verb(

@@ -33,10 +33,9 @@ def plot_losses(metrics_csv: str | Path) -> Figure:
     curves = read_curves(Path(metrics_csv))
     figure, panels = make_panels(len(curves))
     for panel, (term, splits) in zip(panels, curves.items()):
-        for colour, (split, points) in zip(COLOURS, splits.items()):
-            steps, values = np.array(points).T
-            dots = {"marker": "o", "markersize": 3} if len(steps) < 30 else {}
-            panel.plot(steps, values, color=colour, linewidth=1.4, label=split, **dots)
+        for split, points in splits.items():
+            dots = {"marker": "o", "markersize": 3} if len(points) < 30 else {}
+            panel.plot(*np.array(points).T, linewidth=1.4, label=split, **dots)
         values = np.array([value for points in splits.values() for _, value in points])
         if (values > 0).all() and values.max() > 20 * values.min():
             panel.set_yscale("log")
@@ -55,7 +54,7 @@ def plot_outfits(rows: Sequence[Score], metric: str) -> Figure:
         bars = [(x, cells.get(Place(method, outfit, metric))) for x, outfit in enumerate(outfits)]
         left = [x - 0.4 + width * (place + 0.5) for x, cell in bars if cell]
         heights = [cell.value * known.scale for _, cell in bars if cell]
-        panel.bar(left, heights, 0.92 * width, color=colour_of(place), label=method)
+        panel.bar(left, heights, 0.92 * width, label=method)
     panel.set_xticks(range(len(outfits)), outfits, fontsize=8)
     return _finish(figure, [panel], "", f"{known.name} ({known.shown_in})")
 
@@ -66,11 +65,11 @@ def plot_fractions(rows: Sequence[Score], metric: str) -> Figure:
     Floors that were not trained are level lines.
     """
     (known,) = find_metrics([metric])
-    groups = grouped(_by_method(rows, metric).values(), lambda mine: mine[0].method)
+    groups = grouped(grouped(aggregate.rows_of(rows, [metric]), method_key).values(), lambda mine: mine[0].method)
     figure, (panel,) = make_panels(1, (6.0, 3.4))
     for place, method in enumerate(aggregate.order_methods(groups)):
         points = sorted((100 * mine[0].fraction, frame_weighted_mean(mine) * known.scale) for mine in groups[method])
-        style = {"color": colour_of(place), "label": method}
+        style = {"color": COLOURS[place % len(COLOURS)], "label": method}
         if method in FLOORS[:2]:
             panel.axhline(points[0][1], linewidth=1.2, linestyle=":", **style)
         else:
@@ -85,12 +84,12 @@ def plot_fractions(rows: Sequence[Score], metric: str) -> Figure:
 def plot_times(rows: Sequence[Score], metric: str) -> Figure:
     """The mean over frames of one metric against the minutes of training a run, a point a method and variant."""
     (known,) = find_metrics([metric])
-    groups = _by_method(rows, metric)
+    groups = grouped(aggregate.rows_of(rows, [metric]), method_key)
     means = {method: frame_weighted_mean(mine) * known.scale for method, mine in groups.items()}
     figure, (panel,) = make_panels(1, (6.0, 3.4))
-    for place, method in enumerate(m for m in aggregate.order_methods(groups) if groups[m][0].steps):
+    for method in (m for m in aggregate.order_methods(groups) if groups[m][0].steps):
         minutes = sum(row.seconds for row in groups[method]) / len(groups[method]) / 60
-        panel.plot(minutes, means[method], "o", color=colour_of(place), markersize=6, label=method)
+        panel.plot(minutes, means[method], "o", markersize=6, label=method)
     for method, level in means.items():
         if base_method(method) == "sampling":
             panel.axhline(level, color=INK, linewidth=1.0, linestyle=":", label=method)
@@ -106,17 +105,12 @@ def plot_progress(logs: Mapping[str, Mapping[str, Path]]) -> Figure:
     figure, panels = make_panels(len(logs))
     methods = aggregate.order_methods({method for mine in logs.values() for method in mine})
     for panel, (outfit, mine) in zip(panels, logs.items()):
-        for place, method in enumerate(methods):
+        for method in methods:
             points = read_curves(mine[method], "seconds").get("chamfer", {}) if method in mine else {}
             curve = [(seconds / 60, value * 1e4) for seconds, value in points.get("validation", [])]
-            panel.plot(*zip(*curve or [(np.nan, np.nan)]), ".-", color=colour_of(place), linewidth=1.4, label=method)
+            panel.plot(*zip(*curve or [(np.nan, np.nan)]), ".-", linewidth=1.4, label=method)
         panel.set_title(outfit, fontsize=9, color=INK)
     return _finish(figure, panels, "minutes of training", "Chamfer, held back (1e-4 m²)")
-
-
-def _by_method(rows: Sequence[Score], metric: str) -> dict[str, list[Score]]:
-    """The rows of one metric by method and variant; an `AvatarError` where there are none."""
-    return grouped(aggregate.rows_of(rows, [metric]), method_key)
 
 
 def _finish(figure: Figure, panels: Sequence[Axes], across: str = "", up: str = "") -> Figure:
@@ -127,11 +121,6 @@ def _finish(figure: Figure, panels: Sequence[Axes], across: str = "", up: str = 
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=8, frameon=False, fontsize=8, labelcolor=INK)
     return figure
-
-
-def colour_of(place: int) -> str:
-    """The colour of the method at a place in the legend."""
-    return COLOURS[place % len(COLOURS)]
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
@@ -192,6 +181,7 @@ def make_panels(count: int, size: tuple[float, float] | None = None) -> tuple[Fi
     figure = require("matplotlib.figure").Figure(figsize=size, layout="constrained")
     panels = [figure.add_subplot(rows, columns, place + 1) for place in range(count)]
     for panel in panels:
+        panel.set_prop_cycle(color=COLOURS)
         panel.spines[["top", "right"]].set_visible(False)
         panel.spines[["left", "bottom"]].set_color(INK)
         panel.tick_params(colors=INK, labelsize=7, width=0.6, which="both")

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 COLUMNS = ("ground truth", "prediction", "template", "mesh", "error")
 WEBP = {"format": "WEBP", "quality": 90, "method": 4}
-
-
 STYLE = """
 :root { color-scheme: light dark; --page: #f6f6f3; --card: #fff; --ink: #1c2027; --soft: #646b76; --line: #e2e2dd;
   --accent: #2f6fc9; --missing: #9a6a12; --paper: #fff; }
@@ -141,19 +139,20 @@ class ReportContent:
 def write_report(run_folder: str | Path, content: ReportContent) -> Path:
     """Writes ``report.html`` into a run's folder and returns its path.
 
-    Raises:
-        AvatarError: when a picture is not an image, or a row has another number of pictures than columns.
-        DataError: when the training log is there and cannot be read.
+    Raises `AvatarError` when a picture is not an image, or a row has another number of pictures than columns, and
+    `DataError` when the training log is there and cannot be read.
     """
-    folder, text = Path(run_folder), content.config_yaml
-    settings = f"<pre>{escape(text)}</pre>" if text.strip() else _missing("No configuration was recorded.")
+    folder, text, log = Path(run_folder), content.config_yaml, content.metrics_csv
     files = "".join(_file(folder, Path(file)) for file in content.files)
+    no_log = f"No training log{f' at {log}' if log else ''}, so there are no loss curves."
     sections = {
-        "Summary": _summary(content),
-        "Pictures": _pictures(content),
+        "Summary": _summary(content) or _missing("No summary was given."),
+        "Pictures": _pictures(content) if content.pictures else _missing("No pictures were made for this run."),
         "Metrics": _metrics(content),
-        "Training": _training(content.metrics_csv),
-        "Configuration": settings,
+        "Training": _plot(plot_losses(log), "losses", "Loss terms over training steps")
+        if log and Path(log).is_file()
+        else _missing(no_log),
+        "Configuration": f"<pre>{escape(text)}</pre>" if text.strip() else _missing("No configuration was recorded."),
         "Files": f'<ul class="files">{files}</ul>' if files else _missing("This run made no files."),
     }
     page = PAGE.substitute(
@@ -172,11 +171,7 @@ def write_report(run_folder: str | Path, content: ReportContent) -> Path:
 
 
 def picture_source(image: np.ndarray) -> str:
-    """An image as a WebP data URI.
-
-    Raises:
-        AvatarError: when it is not ``(H, W, 3 or 4)`` uint8 with at least one pixel.
-    """
+    """An image ``(H, W, 3 or 4)`` uint8 as a WebP data URI; an `AvatarError` for any other or an empty one."""
     image = np.asarray(image)
     check_shape("image", image, "H W C")
     if image.dtype != np.uint8 or image.shape[2] not in (3, 4) or not image.size:
@@ -192,15 +187,12 @@ def _missing(text: str) -> str:
 
 def _summary(content: ReportContent) -> str:
     paragraphs = [f"<p>{escape(part.strip())}</p>" for part in content.summary.split("\n\n") if part.strip()]
-    facts = [f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in content.facts.items()]
-    if facts:
-        paragraphs.append('<dl class="facts">' + "".join(facts) + "</dl>")
-    return "\n".join(paragraphs) or _missing("No summary was given.")
+    if facts := "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in content.facts.items()):
+        paragraphs.append(f'<dl class="facts">{facts}</dl>')
+    return "\n".join(paragraphs)
 
 
 def _pictures(content: ReportContent) -> str:
-    if not content.pictures:
-        return _missing("No pictures were made for this run.")
     cells = [f'<div class="head">{escape(column)}</div>' for column in content.columns]
     for row in content.pictures:
         if len(row.pictures) != len(content.columns):
@@ -209,50 +201,34 @@ def _pictures(content: ReportContent) -> str:
                 f"where there is none), got {len(row.pictures)}."
             )
         cells.append(f'<div class="pose">{escape(row.title)}</div>')
-        cells += [_picture(picture, column) for picture, column in zip(row.pictures, content.columns)]
+        for picture, column in zip(row.pictures, content.columns):
+            cell = _missing(f"no {column}")
+            if picture is not None:
+                source, (height, width) = picture_source(picture.image), picture.image.shape[:2]
+                cell = f'<img src="{source}" alt="{escape(picture.alt)}" width="{width}" height="{height}">'
+                cell += f"<figcaption>{escape(picture.caption)}</figcaption>" if picture.caption else ""
+            cells.append(f"<figure>{cell}</figure>")
     grid = "\n".join(cells)
     return f'<div class="wide"><div class="pictures" style="--columns:{len(content.columns)}">\n{grid}\n</div></div>'
 
 
-def _picture(picture: Picture | None, column: str) -> str:
-    if picture is None:
-        return f"<figure>{_missing('no ' + column)}</figure>"
-    source, (height, width) = picture_source(picture.image), picture.image.shape[:2]
-    caption = f"<figcaption>{escape(picture.caption)}</figcaption>" if picture.caption else ""
-    size = f'width="{width}" height="{height}"'
-    return f'<figure><img src="{source}" alt="{escape(picture.alt)}" {size}>{caption}</figure>'
-
-
 def _metrics(content: ReportContent) -> str:
-    parts = [_table(table) for table in content.tables] or [_missing("No predictions of this run were scored.")]
+    parts = [] if content.tables else [_missing("No predictions of this run were scored.")]
+    for table in content.tables:
+        head = "".join(f'<th scope="col">{escape(column)}</th>' for column in (table.corner, *table.heads))
+        rows = []
+        for row in table.rows:
+            cells = "".join(f"<td>{escape(cell)}</td>" for cell in row.cells)
+            kind = ' class="summary"' if row.summary else ""
+            rows.append(f'<tr{kind}><th scope="row">{escape(row.label)}</th>{cells}</tr>')
+        body = f"<thead><tr>{head}</tr></thead>\n<tbody>" + "\n".join(rows) + "</tbody>"
+        parts.append(f'<h3>{escape(table.title)}</h3>\n<div class="wide"><table>{body}</table></div>')
     for place, (title, figure) in enumerate(content.figures):
         parts.append(f"<h3>{escape(title)}</h3>\n{_plot(figure, f'figure{place}', title)}")
     notes = dict.fromkeys(note for table in content.tables for note in table.notes)
-    if notes:
-        listed = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    if listed := "".join(f"<li>{escape(note)}</li>" for note in notes):
         parts.append(f'<h3>Definitions</h3>\n<ul class="notes">{listed}</ul>')
     return "\n".join(parts)
-
-
-def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in (table.corner, *table.heads))
-    rows = []
-    for row in table.rows:
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row.cells)
-        kind = ' class="summary"' if row.summary else ""
-        rows.append(f'<tr{kind}><th scope="row">{escape(row.label)}</th>{cells}</tr>')
-    body = "\n".join(rows)
-    return (
-        f"<h3>{escape(table.title)}</h3>\n"
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
-    )
-
-
-def _training(metrics_csv: Path | None) -> str:
-    if metrics_csv is None or not Path(metrics_csv).is_file():
-        place = f" at {metrics_csv}" if metrics_csv else ""
-        return _missing(f"No training log{place}, so there are no loss curves.")
-    return _plot(plot_losses(metrics_csv), "losses", "Loss terms over training steps")
 
 
 def _plot(figure: Figure, prefix: str, title: str) -> str:

@@ -77,10 +77,8 @@ def compare(config: CompareConfig) -> Path:
 
     ``.csv`` and ``.frames.csv`` hold the tidy scores, ``.md`` and ``.tex`` the tables, ``.differences.csv`` those to
     the baseline, ``.<plot>.png`` the plots, ``.poses.jpg`` the same unseen poses by all methods. Canonicalizers can be
-    compared alone; ``.canonical.csv`` holds their scores.
-
-    Raises:
-        AvatarError: when nothing was scored, or when outfits of one name in two data sets would share a row.
+    compared alone; ``.canonical.csv`` holds their scores. Raises `AvatarError` when nothing was scored, or when
+    outfits of one name in two data sets would share a row.
     """
     found, pictures = [], []
     if config.runs or not config.canonicalizers:
@@ -99,12 +97,11 @@ def compare_runs(config: CompareConfig, runs: tuple[Path, ...]) -> tuple[list[Ta
     write_scores(file_of(config, "csv"), scores)
     variants = {row.variant for row in scores.rows if row.method not in FLOORS[:2]}
     shared = variants.pop() if len(variants) == 1 else ""  # of all trained methods: it tells nothing apart
-    scores = Scores(
-        *(
-            [replace(row, variant=row.variant if row.variant != shared else "") for row in mine]
-            for mine in (scores.rows, scores.frames)
-        )
+    rows, frames = (
+        [replace(row, variant="") if row.variant == shared else row for row in mine]
+        for mine in (scores.rows, scores.frames)
     )
+    scores = Scores(rows, frames)
     splits = list(dict.fromkeys(row.split for row in scores.rows))
     found = [*main_tables(config, scores.rows, splits), *side_tables(config, scores, splits)]
     found[0] = replace(found[0], notes=(*found[0].notes, *([f"All methods: {shared}."] if shared else [])))
@@ -130,11 +127,7 @@ def named_runs(config: CompareConfig) -> Iterator[Path]:
 
 
 def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
-    """The scores of runs behind those of their outfits' floors.
-
-    Raises:
-        AvatarError: when there are none, or outfits of one name come from several data sets.
-    """
+    """The scores of runs behind those of their outfits' floors."""
     files = [scores_file(run, split) for run in runs for split in config.splits]
     if old := [str(path) for path in files if path.is_file() and not are_current(path)]:
         log.warning("compare: scored by other code than today's, or edited: %s. Score them again.", ", ".join(old))
