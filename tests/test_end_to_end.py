@@ -23,7 +23,7 @@ from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, CycleConfig
 from avatar.methods.settings import MethodChoice
 from avatar.pipeline.comparison import CompareConfig, compare
-from avatar.pipeline.demo import DemoConfig, demo
+from avatar.pipeline.experiments import DemoConfig, demo
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
 from avatar.simulate.sequences import authored_motion

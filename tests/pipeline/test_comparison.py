@@ -4,8 +4,8 @@ import csv
 
 import pytest
 
-from avatar.evaluation.forms import Axis, FormConfig
 from avatar.evaluation.scores import FrameScore, Score, Scores, read_scores, write_scores
+from avatar.evaluation.tables import Axis, FormConfig
 from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.scores import floors_folder, scores_file
 

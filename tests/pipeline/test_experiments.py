@@ -16,9 +16,9 @@ from avatar.checks import AvatarError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
 from avatar.evaluation import scoring
-from avatar.evaluation.forms import Axis, FormConfig, ReportedTable
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
+from avatar.evaluation.tables import Axis, FormConfig, ReportedTable
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
 from avatar.methods.settings import MethodChoice
@@ -97,7 +97,7 @@ def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatc
     other = replace(jobs[1], score=replace(jobs[1].score, seed=5))
     assert again(other) == 3 and (run / "scores.csv").read_bytes() != before[run / "scores.csv"]
     assert again(jobs[1]) == 0
-    change_source("avatar.evaluation.closest")
+    change_source("avatar.evaluation.shapes")
     assert again(jobs[1]) == 3 and again(jobs[1]) == 0
     assert before == {path: path.read_bytes() for path in before}
 

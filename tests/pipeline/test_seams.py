@@ -8,7 +8,9 @@ import torch
 
 from avatar.checks import AvatarError
 from avatar.evaluation.scoring import Label
-from avatar.evaluation.seams import (
+from avatar.geometry.surface import interpolate
+from avatar.geometry.uv import sample_uv, seam_edges
+from avatar.pipeline.seams import (
     BODY,
     OTHERS,
     SEAMS,
@@ -24,8 +26,6 @@ from avatar.evaluation.seams import (
     seam_table,
     seams_csv,
 )
-from avatar.geometry.surface import interpolate
-from avatar.geometry.uv import sample_uv, seam_edges
 from avatar.records import PointCloud, Scan, Template
 
 CELLS, SIDE = 20, 0.4  # a sheet of 20 x 20 squares, 40 cm wide, cut at x = 0
