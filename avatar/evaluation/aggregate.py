@@ -109,10 +109,7 @@ def rows_of(rows: Iterable[Score], metrics: Collection[str]) -> list[Score]:
 
 
 def average_seeds(rows: Iterable[Score], by_fraction: bool = False) -> dict[Place, Cell]:
-    """Means over training seeds, in the metrics' units; ``by_fraction`` keeps the share of frames out of the names.
-
-    Raises `AvatarError` for two rows of one seed for the same number.
-    """
+    """Means over training seeds, in the metrics' units; ``by_fraction`` keeps the share of frames out of the names."""
 
     def place_of(row: Score) -> Place:
         share = f"{100 * row.fraction:g}%" if by_fraction else ""
@@ -159,8 +156,7 @@ def bootstrap_mean(
 ) -> Interval:
     """The mean of all values with its percentile bootstrap interval; values are redrawn within their group.
 
-    They count as independent: true of settled poses; neighbours in a motion are alike, and the interval is then too
-    narrow.
+    They count as independent: true of settled poses; for neighbours in a motion the interval is too narrow.
     """
     groups = [np.asarray(values, np.float64) for values in groups]
     count = sum(map(len, groups))
@@ -176,8 +172,7 @@ def compare_methods(
 ) -> list[Difference]:
     """Differences of every method to the baseline, paired by frame: for each outfit, then for all together.
 
-    A method's baseline is that of its own variant where there is one, else the plain or the only one. Raises
-    `AvatarError` when the baseline was not scored.
+    A method's baseline is that of its own variant where there is one, else the plain or the only one.
     """
     frames = [row for row in scores.frames if row.metric == metric]
     methods = order_methods({method_key(row) for row in frames})

@@ -1,7 +1,6 @@
 """Canonicalizations scored against the truth, which only a simulator knows: where a scan point is at rest.
 
-What the cloth itself does between the two poses is in the error as well, the same for every method. A reference says
-how much: each point unposed with the weights of the body under its true place.
+What the cloth does between the poses is in the error as well; the reference of true weights says how much.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from avatar.data.outfits import Outfit
 from avatar.evaluation.aggregate import method_key
 from avatar.evaluation.metrics import CENTIMETRES, PERCENT, Metric, find_metrics
 from avatar.evaluation.scores import Score, Scores
-from avatar.evaluation.scoring import Contender, Label, remember, score_frames
+from avatar.evaluation.scoring import Contender, Label, Memory, score_frames
 from avatar.evaluation.shapes import closest_on_mesh
 from avatar.evaluation.tables import Table, tabulate_metrics
 from avatar.geometry.transforms import invert_affine, transform_points
@@ -37,10 +36,9 @@ SURFACE_POINTS = 2_000  # canonical points a frame whose distance to the true su
 
 @dataclass(frozen=True)
 class Canonicalized:
-    """What a method made of one frame: its canonical ``scan``, and the weights it gives to points where they are now.
+    """A frame's canonical ``scan``, and ``forward_weights (M, J)`` at its points, which pose it again: does it close?
 
-    ``forward_weights (M, J)`` are evaluated at the canonical points (the forward field g^c, or the weights of the
-    nearest vertices of the body at rest); they pose the scan again, and tell whether the cycle closes.
+    They are the forward field g^c, or the weights of the nearest vertices of the body at rest.
     """
 
     scan: CanonicalScan
@@ -49,10 +47,8 @@ class Canonicalized:
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """What is known of the ``M`` points of one posed scan.
-
-    ``canonical (M, 3)`` places at rest; ``weights (M, J)`` of the body under them; ``garment (M,)`` bool, on cloth;
-    ``contact (M,)`` bool, where the scan touches itself (`contact_points`).
+    """The points of a posed scan at rest ``(M, 3)``, the body's weights under them ``(M, J)``, which are on garments,
+    and which touch another part (`contact_points`), both ``(M,)`` bool.
     """
 
     canonical: np.ndarray
@@ -75,10 +71,7 @@ def frame_truth(scan: Scan, template: Template) -> FrameTruth:
 
 
 def contact_points(points: np.ndarray, canonical: np.ndarray) -> np.ndarray:
-    """Which points ``(M, 3)``, at rest at ``canonical (M, 3)``, touch another part of the scan, ``(M,)`` bool.
-
-    Another point is within 2 cm now and more than 10 cm away at rest.
-    """
+    """Which points ``(M, 3)`` are within 2 cm of one that is over 10 cm away at rest ``(M, 3)``, ``(M,)`` bool."""
     touching = np.zeros(len(points), bool)
     pairs = build_tree(points).query_pairs(CONTACT, output_type="ndarray")
     apart = np.linalg.norm(canonical[pairs[:, 0]] - canonical[pairs[:, 1]], axis=1) > APART
@@ -121,8 +114,7 @@ def _posed_from_canonical(weights: np.ndarray, body: BodyFit, template: Template
 class CanonicalComparison:
     """What a metric sees of one canonicalized frame: errors of its kept points, in metres, float64.
 
-    ``surfaces`` are the true canonical surfaces, a mesh for each label; without them `off_surface` is not known. Wrong
-    shapes and indices into another scan than the frame's are an `AvatarError`.
+    ``surfaces`` are the true ones at rest, a mesh a label. Indices into another scan than the frame's are refused.
     """
 
     def __init__(
@@ -251,10 +243,9 @@ def score_canonicalization(
 ) -> Scores:
     """Every metric of some frames for several canonicalizations, and for the true weights beside them.
 
-    ``methods`` are labels and what each makes of a frame as the simulated outfit loads it. Metrics that a frame has not
-    (no contact, no triangles) are left out of the means. With a ledger only new or changed values are measured;
-    ``made_by`` is then a hash of all that each method's canonical scans depend on but the data. Raises `AvatarError`
-    naming the frame, for data without truth or a scan that is not the frame's.
+    ``methods`` are labels and what each makes of a frame as the simulated outfit loads it. With a ledger only new or
+    changed values are measured; ``made_by`` is a hash of all that each method's scans depend on but the data. Raises
+    `AvatarError` naming the frame, for data without truth or a scan that is not the frame's.
     """
     if not methods or not names:
         raise AvatarError(f"methods, names: expected at least one each, got {len(methods)} and {len(names)}.")
@@ -274,7 +265,7 @@ def score_canonicalization(
     contenders = []
     for label, method in {true: None, **methods}.items():
         made = {"made_by": ledger and {true: "", **(made_by or {})}[label]}
-        memory = remember(ledger, f"canonical {label.method}", outfit, split, SOURCE, **made)
+        memory = Memory(ledger, f"canonical {label.method}", outfit, split, SOURCE, **made)
         contenders.append(Contender(label, partial(compare, method), memory))
     return score_frames(outfit, split, names, list(CANONICAL_METRICS.values()), contenders)
 
@@ -292,10 +283,7 @@ def canonical_surfaces(outfit: Outfit, split: str, name: str) -> dict[int, Mesh]
 def canonical_table(
     rows: Sequence[Score], outfits: Sequence[str], metrics: Sequence[str] = tuple(CANONICAL_METRICS)
 ) -> Table:
-    """Canonicalization metrics by methods, a line each for some outfits, true weights first, with the definitions.
-
-    Raises `AvatarError` for unknown metrics, or an outfit that nobody scored.
-    """
+    """Canonicalization metrics of some outfits by methods, true weights first, with the definitions."""
     known = {metric.name: metric for metric in find_metrics(metrics, CANONICAL_METRICS)}
     last = {(row.outfit, method_key(row), row.metric): row for row in rows}  # several runs score the same baselines
     table = tabulate_metrics(list(last.values()), outfits, known, TRUE)

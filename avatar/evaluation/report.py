@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
@@ -18,9 +17,6 @@ from avatar.checks import AvatarError, check_shape, require
 from avatar.evaluation.plots import inline_svg, plot_losses
 from avatar.evaluation.tables import Table
 from avatar.io.npz import write_whole
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 COLUMNS = ("ground truth", "prediction", "template", "mesh", "error")
 WEBP = {"format": "WEBP", "quality": 90, "method": 4}
@@ -130,7 +126,6 @@ class ReportContent:
     config_yaml: str = ""
     metrics_csv: Path | None = None
     tables: tuple[Table, ...] = ()
-    figures: tuple[tuple[str, Figure], ...] = ()  # more plots, each with its title, shown below the tables
     columns: tuple[str, ...] = COLUMNS
     pictures: tuple[PictureRow, ...] = ()
     files: tuple[Path, ...] = ()
@@ -144,14 +139,14 @@ def write_report(run_folder: str | Path, content: ReportContent) -> Path:
     """
     folder, text, log = Path(run_folder), content.config_yaml, content.metrics_csv
     files = "".join(_file(folder, Path(file)) for file in content.files)
-    no_log = f"No training log{f' at {log}' if log else ''}, so there are no loss curves."
+    training = _missing(f"No training log{f' at {log}' if log else ''}, so there are no loss curves.")
+    if log and Path(log).is_file():
+        training = f'<div class="plot">{inline_svg(plot_losses(log), "losses", "Loss terms over training steps")}</div>'
     sections = {
         "Summary": _summary(content) or _missing("No summary was given."),
         "Pictures": _pictures(content) if content.pictures else _missing("No pictures were made for this run."),
         "Metrics": _metrics(content),
-        "Training": _plot(plot_losses(log), "losses", "Loss terms over training steps")
-        if log and Path(log).is_file()
-        else _missing(no_log),
+        "Training": training,
         "Configuration": f"<pre>{escape(text)}</pre>" if text.strip() else _missing("No configuration was recorded."),
         "Files": f'<ul class="files">{files}</ul>' if files else _missing("This run made no files."),
     }
@@ -223,16 +218,10 @@ def _metrics(content: ReportContent) -> str:
             rows.append(f'<tr{kind}><th scope="row">{escape(row.label)}</th>{cells}</tr>')
         body = f"<thead><tr>{head}</tr></thead>\n<tbody>" + "\n".join(rows) + "</tbody>"
         parts.append(f'<h3>{escape(table.title)}</h3>\n<div class="wide"><table>{body}</table></div>')
-    for place, (title, figure) in enumerate(content.figures):
-        parts.append(f"<h3>{escape(title)}</h3>\n{_plot(figure, f'figure{place}', title)}")
     notes = dict.fromkeys(note for table in content.tables for note in table.notes)
     if listed := "".join(f"<li>{escape(note)}</li>" for note in notes):
         parts.append(f'<h3>Definitions</h3>\n<ul class="notes">{listed}</ul>')
     return "\n".join(parts)
-
-
-def _plot(figure: Figure, prefix: str, title: str) -> str:
-    return f'<div class="plot">{inline_svg(figure, prefix, title)}</div>'
 
 
 def _file(folder: Path, file: Path) -> str:

@@ -19,10 +19,9 @@ Row = TypeVar("Row", "Score", "FrameScore")
 class Score:
     """One number of a results table: a metric's mean over the frames of one outfit for one method.
 
-    ``variant`` tells settings of a method apart, ``seed``, ``steps`` and ``seconds`` are those of its training,
-    ``points`` is the mean count of predicted points, ``commit`` the code that made it, ``dataset`` the outfit's,
-    ``fraction`` the share of the training frames that was trained on, ``split`` whose frames were scored. Files without
-    the last three are older.
+    ``variant`` tells settings of a method apart, ``seed``, ``steps``, ``seconds`` and ``fraction`` of the frames are of
+    its training, ``points`` is the mean count of predicted points, ``commit`` the code that made it. Files without
+    the last three columns are older.
     """
 
     table: str
@@ -73,10 +72,7 @@ class Scores:
 
 
 def write_scores(path: str | Path, scores: Scores) -> None:
-    """Writes the means to a CSV and single frames, if any, to ``<stem>.frames.csv`` beside it, whole or not at all.
-
-    Numbers are written so that reading gives back the same bits.
-    """
+    """Writes means to a CSV and single frames, if any, to ``<stem>.frames.csv`` beside it, so that no bit is lost."""
     path = Path(path)
     for file, kind, rows in ((path, Score, scores.rows), (frames_path(path), FrameScore, scores.frames)):
         if rows or kind is Score:
@@ -88,7 +84,7 @@ def write_scores(path: str | Path, scores: Scores) -> None:
 def read_scores(*paths: str | Path) -> Scores:
     """Reads what `write_scores` wrote to one or several files; those of single frames may be missing.
 
-    Raises `DataError` naming the file and what is wrong: missing, other columns, or a value of the wrong kind.
+    Raises `DataError` for a missing file, other columns, or a value of the wrong kind.
     """
     scores = Scores()
     for path in map(Path, paths):

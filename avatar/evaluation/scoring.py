@@ -35,10 +35,7 @@ SIZE_RATIO = 5.0  # a prediction this many times larger or smaller than its scan
 
 @dataclass
 class ScoreConfig:
-    """How predictions are scored.
-
-    The same scan points are drawn for every method: a frame's draw depends on ``seed`` and its name alone.
-    """
+    """How predictions are scored: all against the same scan points, drawn by ``seed`` and the frame's name alone."""
 
     scan_points: int = 40_000  # scan points compared a frame; all of them where a scan has fewer
     metrics: list[str] = field(default_factory=lambda: list(METRIC_NAMES))
@@ -66,17 +63,25 @@ class Label:
     split: str = "test"
 
 
-@dataclass(frozen=True)
 class Memory:
-    """Values that were measured before, each metric of each frame for itself.
+    """Values of one method on an outfit that were measured before, each metric of each frame for itself.
 
-    ``ledger`` keeps them (None: nothing is kept), ``what`` says in words what is scored, and ``made_of`` gives the hash
-    of all that a frame's values are made of.
+    ``ledger`` keeps them (None: nothing is kept); ``what`` is the method in words. ``source`` are the modules that make
+    the values (see `keyed`), ``made`` is what else they depend on; functions are asked for each frame by its name.
     """
 
-    ledger: Ledger | None
-    what: str
-    made_of: Callable[[str], str]
+    def __init__(
+        self, ledger: Ledger | None, what: str, outfit: Any, split: str, source: tuple[str, ...] = SOURCE, **made: Any
+    ):
+        self.ledger, self.what = ledger, f"{what} {outfit.name} {split}"
+
+        @functools.cache
+        def made_of(name: str) -> str:
+            parts = {key: value(name) if callable(value) else value for key, value in made.items()}
+            scanner = vars(outfit.scanner) if hasattr(outfit, "scanner") else None
+            return keyed(source, frame=outfit.digest(split, name), scanner=scanner, **parts)
+
+        self.made_of = made_of  # the hash of all that a frame's values are made of
 
     def recall(self, frame: str, metrics: Iterable[str]) -> tuple[dict[str, float], int]:
         """The known values of a frame by metric, and its point count; nothing that was made of something else."""
@@ -102,24 +107,6 @@ class Contender(NamedTuple):
     memory: Memory
 
 
-def remember(
-    ledger: Ledger | None, what: str, outfit: Any, split: str, source: tuple[str, ...] = SOURCE, **made: Any
-) -> Memory:
-    """The memory of one method's scores on an outfit, which has a `digest` and maybe a ``scanner``.
-
-    ``what`` is the method in words, ``source`` the modules that make the values (see `keyed`), ``made`` what else they
-    depend on; functions are asked for each frame by its name.
-    """
-
-    @functools.cache
-    def made_of(name: str) -> str:
-        parts = {key: value(name) if callable(value) else value for key, value in made.items()}
-        scanner = vars(outfit.scanner) if hasattr(outfit, "scanner") else None
-        return keyed(source, frame=outfit.digest(split, name), scanner=scanner, **parts)
-
-    return Memory(ledger, f"{what} {outfit.name} {split}", made_of)
-
-
 def score_predictions(
     folder: str | Path,
     outfit: Outfit,
@@ -131,12 +118,9 @@ def score_predictions(
 ) -> Scores:
     """Scores a folder of predictions, ``<frame>.ply`` with normals for every frame of a split of an outfit.
 
-    Files that belong to no frame are ignored with a warning. ``meshes`` is a folder of predicted meshes, ``.ply`` or
-    ``.obj``, which s2m_cm and normal_consistency then measure instead of the points. ``ledger`` keeps values, so that
-    only new or changed ones are measured; None measures all. Penetration is scored where the outfit has a template.
-
-    Raises `DataError` when frames have no prediction (naming them) or one is in other units than its scan, and
-    `AvatarError` naming the frame when a prediction is not valid.
+    ``meshes`` is a folder of predicted meshes, ``.ply`` or ``.obj``, which s2m_cm and normal_consistency then measure
+    instead of the points. Values that ``ledger`` keeps are not measured again. Raises `DataError` when frames have no
+    prediction (naming them) or one is in other units than its scan, and `AvatarError` naming a frame that is not valid.
     """
     names = frame_names(outfit, split)
     clouds = find_predictions(Path(folder), names, (".ply",))
@@ -172,9 +156,9 @@ def measure_floors(
 ) -> Scores:
     """Scores floors as if they were predictions of so many ``points``, each frame for itself.
 
-    ``sampling`` is a second sampling of the true surface: what a perfect surface scores. An outfit without ``resample``
-    has only its scan points: they are split into halves, scored against each other and marked as variant ``halves``;
-    with fewer points that floor is too high. ``body`` are points spread area-uniformly over the posed bare body.
+    ``sampling`` is a second sampling of the true surface: what a perfect surface scores. Outfits without ``resample``
+    have their scan points split into halves that are scored against each other, marked as variant ``halves``: with
+    fewer points that floor is too high. ``body`` are points spread area-uniformly over the posed bare body.
     """
     resample, config = getattr(outfit, "resample", None), replace(config, motion=False)
 
@@ -210,7 +194,7 @@ def remember_points(
 ) -> Memory:
     """The memory of scores of points; none for motion, whose frames depend on each other."""
     drawn = {"scan_points": config.scan_points, "seed": config.seed}
-    return remember(None if config.motion else ledger, what, outfit, split, **drawn, **made)
+    return Memory(None if config.motion else ledger, what, outfit, split, **drawn, **made)
 
 
 def point_metrics(outfit: Outfit, config: ScoreConfig, surfaces: Any = ()) -> list[Metric]:
@@ -270,10 +254,7 @@ def frame_names(outfit: Outfit, split: str) -> list[str]:
 
 
 def find_predictions(folder: Path, names: Sequence[str], suffixes: tuple[str, ...] = (".ply",)) -> dict[str, Path]:
-    """The file of every frame in a folder of predictions; files of no frame are a warning.
-
-    Raises `DataError` when there is no such folder, or naming the frames that have no file.
-    """
+    """The file of every frame in a folder of predictions; missing ones are refused, files of no frame a warning."""
     if not folder.is_dir():
         raise DataError(folder, "there is no such folder of predictions.", "Run tools/predict.py first.")
 
@@ -304,8 +285,7 @@ def score_frames(
     """Every metric of every frame of some contenders, frame by frame, and their means.
 
     Values that a memory knows are not measured again; those that a frame does not have (NaN) are left out of the means.
-    Errors of metrics and comparisons are passed on with the frame's name. With ``motion`` metrics of sequences are
-    measured too.
+    Errors are passed on with the frame's name. ``motion`` measures metrics of sequences too.
     """
     frames: list[FrameScore] = []
     found: dict[Label, dict[str, list[float]]] = {c.label: {m.name: [] for m in metrics} for c in contenders}

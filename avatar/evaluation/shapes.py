@@ -24,10 +24,7 @@ EDGE_ON = 1e-3  # discs whose normal has less than this towards the viewer are n
 
 
 class SurfaceHits(NamedTuple):
-    """Closest points ``(N, 3)`` on a mesh and signed distances ``(N,)`` to them, metres.
-
-    Distances are negative inside (behind the surface, by the pseudo-normal at the closest point).
-    """
+    """Closest points ``(N, 3)`` on a mesh and signed distances ``(N,)`` to them, metres, negative inside."""
 
     points: np.ndarray
     signed_distances: np.ndarray
@@ -39,10 +36,9 @@ def closest_on_mesh(
     """The closest point of a mesh ``(V, 3)``, ``(F, 3)`` to each query ``(N, 3)``, exactly, and the query's side of it.
 
     The sign is that of the angle-weighted pseudo-normal (Baerentzen and Aanaes 2005), which is right for every closed
-    mesh wound counter-clockwise from outside, also where the closest point is an edge or a vertex. Beyond
-    ``exact_within`` metres the first triangles tried will do (the distance is then too large, by less than the size of
-    an average triangle); that saves most of the time where far points do not matter. Raises `AvatarError` on wrong
-    shapes, non-finite coordinates or a mesh without faces.
+    mesh wound counter-clockwise from outside, also at edges and vertices. Beyond ``exact_within`` metres the first
+    triangles tried will do (the distance is then too large, by less than the size of an average triangle); that saves
+    most of the time where far points do not matter.
     """
     check_shape("queries", queries, "N 3")
     check_shape("vertices", vertices, "V 3")

@@ -48,8 +48,7 @@ class Axis(Enum):
 class FormConfig:
     """Which axes run down a table and which across, the first of several being the slowest.
 
-    An outfit axis has its single outfits, their mean and their worst, as chosen; without an outfit axis a cell is
-    the mean over frames.
+    An outfit axis has its outfits, their mean and their worst, as chosen; else a cell is the mean over frames.
     """
 
     rows: tuple[Axis, ...] = (Axis.outfit,)
@@ -82,10 +81,7 @@ class ReportedTable:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A labelled row; None stands where there is no number. ``summary`` rows are set off from the others.
-
-    ``texts`` are printed in the numbers' place where there is more to say.
-    """
+    """A labelled row, None where there is no number; ``summary`` sets it off, ``texts`` are printed instead of it."""
 
     label: str
     values: tuple[float | None, ...]
@@ -100,9 +96,9 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Table:
-    """A table ready to print: ``corner`` heads the labels, ``notes`` hold the definitions printed below.
+    """A table ready to print: ``corner`` heads the labels, ``notes`` stand below.
 
-    ``groups``, where there are any, stand above the columns: one a column, equal neighbours as one heading.
+    ``groups``, if any, stand above the columns: one a column, equal neighbours as one heading.
     """
 
     title: str
@@ -119,10 +115,7 @@ class Table:
 
 
 def outfit_table(rows: Sequence[Score], metric: str, view: View = View.VALUE) -> Table:
-    """Outfits by methods for one metric, with mean and worst outfit below and its definition in the notes.
-
-    Raises `AvatarError` for an unknown or unscored metric, or a view whose floor was not scored.
-    """
+    """Outfits by methods for one metric, with mean and worst outfit below and its definition in the notes."""
     (known,) = find_metrics([metric])
     cells, ratio = aggregate.average_seeds(aggregate.rows_of(rows, [metric])), view in BASES
     methods, outfits = aggregate.order_methods({p.method for p in cells}), sorted({p.outfit for p in cells})
@@ -154,8 +147,7 @@ def tabulate_metrics(
 ) -> Table:
     """Those of some metrics that were scored by methods, for some outfits, with their definitions in the notes.
 
-    Floors come first, or the method named ``first``. Raises `AvatarError` for an outfit that nobody scored, or two rows
-    for the same number.
+    Floors come first, or the method named ``first``.
     """
     if unknown := [outfit for outfit in outfits if outfit not in {row.outfit for row in rows}]:
         there = ", ".join(sorted({row.outfit for row in rows}))
@@ -177,8 +169,7 @@ def form_table(
     """Scores in a paper's form; methods and outfits in their order of appearance, floors first.
 
     Several seeds of a method are averaged, and named in the notes. With ``excess`` every value is less the sampling
-    floor's on the same outfit. Raises `AvatarError` for unknown metrics, metrics that nobody scored, or two scores of
-    one seed for one cell.
+    floor's on the same outfit.
     """
     known, axes = find_metrics(metrics), (*form.rows, *form.columns)
     cells = aggregate.average_seeds(aggregate.rows_of(rows, metrics), Axis.fraction in axes)

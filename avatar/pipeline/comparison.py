@@ -27,7 +27,7 @@ from avatar.io.points import read_points
 from avatar.pipeline.scores import are_current, predictions_folder, read_floors, scores_file
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
-from avatar.records import PointCloud, Scan
+from avatar.records import PointCloud
 from avatar.settings import settings_from_dict
 
 log = logging.getLogger(__name__)
@@ -82,7 +82,7 @@ def compare(config: CompareConfig) -> Path:
     """
     found, pictures = [], []
     if config.runs or not config.canonicalizers:
-        found, pictures = compare_runs(config, config.runs or tuple(named_runs(config)))
+        found, pictures = compare_runs(config, config.runs or named_runs(config))
     found += canonical_tables(config)
     text = "\n".join([*map(tables.to_markdown, found), *(f"![{path.stem}]({path.name})" for path in pictures), ""])
     write_whole(file_of(config, "md"), text.encode())
@@ -118,12 +118,10 @@ def file_of(config: CompareConfig, suffix: str) -> Path:
     return (config.out or config.runs_root / "tables") / f"{config.table}.{suffix}"
 
 
-def named_runs(config: CompareConfig) -> Iterator[Path]:
+def named_runs(config: CompareConfig) -> tuple[Path, ...]:
     """The scored runs of the data sets, methods and name asked for."""
-    for dataset in config.dataset:
-        for method in config.methods:
-            found = sorted((config.runs_root / method / dataset).glob(f"*/{config.name}/scores.csv"))
-            yield from (path.parent for path in found)
+    folders = [config.runs_root / method / dataset for dataset in config.dataset for method in config.methods]
+    return tuple(path.parent for of in folders for path in sorted(of.glob(f"*/{config.name}/scores.csv")))
 
 
 def gather_scores(config: CompareConfig, runs: tuple[Path, ...]) -> Scores:
@@ -242,10 +240,9 @@ def save_plots(config: CompareConfig, rows: list[Score], runs: tuple[Path, ...])
 
 
 def draw_pose_grid(config: CompareConfig, path: Path, runs: Sequence[Path]) -> bool:
-    """Writes the same unseen poses by all methods beside the ground truth, as in CloSET's figure 4.
+    """Writes the same unseen poses by all methods beside the ground truth, as in CloSET's figure 4; false for none.
 
-    Rows are evenly spaced poses of every outfit, columns the methods, empty where there are no predictions of the
-    split, and the truth. Says whether there were any predictions to draw.
+    Rows are evenly spaced poses of every outfit, columns the methods, blank where there is no prediction, and the truth.
     """
     split, outfits = config.splits[0], {}
     folders: dict[str, dict[str, Path]] = {}  # of predictions, by outfit and method
@@ -265,17 +262,14 @@ def draw_pose_grid(config: CompareConfig, path: Path, runs: Sequence[Path]) -> b
     for name, outfit in outfits.items():
         names = spaced_frames(list(outfit.frames(split)), config.pictures)
         for frame in tracked(names, f"pictures of {name}", unit="picture"):
+            scan = outfit.load(split, frame).scan
+            camera = frame_camera(scan.points, "three_quarter", PICTURE)
+            truth = render_points(PointCloud(scan.points, scan.normals), camera)
             paths = [folders[name][method] / f"{frame}.ply" if method in folders[name] else None for method in methods]
-            rows.append(draw_pose(outfit.load(split, frame).scan, paths))
+            blank = np.full_like(truth, 255)
+            shown = [render_points(read_points(p), camera) if p and p.is_file() else blank for p in paths]
+            rows.append([*shown, truth])
             labels.append(f"{name}: {frame}" if len(outfits) > 1 else frame)
     if outfits:
         save_picture(path, contact_sheet(rows, labels, [*methods, "ground truth"]))
     return bool(outfits)
-
-
-def draw_pose(scan: Scan, predictions: Sequence[Path | None]) -> list[np.ndarray]:
-    """One pose by every method, and its scan, in one framing; blank where there is no prediction."""
-    camera = frame_camera(scan.points, "three_quarter", PICTURE)
-    truth = render_points(PointCloud(scan.points, scan.normals), camera)
-    blank = np.full_like(truth, 255)
-    return [render_points(read_points(p), camera) if p and p.is_file() else blank for p in predictions] + [truth]

@@ -65,10 +65,10 @@ def report(config: ReportConfig) -> Path:
 
 
 def gather_scores(config: ReportConfig, avatar: TrainedAvatar) -> Scores:
-    """The scores on every split of the run and of those it is set against, and the floors, as far as they are there."""
+    """Scores of the run, of those it is set against and of floors, as far as they are there: every split, test first."""
     settings, found = avatar.config, Scores()
     root = scores.floors_root(config.run, settings)
-    for split in (*SPLITS, VALIDATION):
+    for split in ("test", *sorted({*SPLITS, VALIDATION} - {"test"})):
         files = [scores.scores_file(folder, split) for folder in (*config.against, config.run)]
         mine = read_scores(*filter(Path.is_file, files))
         for name in dict.fromkeys(row.outfit for row in mine.rows):
@@ -83,8 +83,8 @@ def headline_facts(avatar: TrainedAvatar, found: Scores) -> dict[str, str]:
         "training": f"{avatar.steps} steps, {avatar.seconds / 60:.1f} min",
         "parameters": f"{sum(p.numel() for p in avatar.model.parameters()):,}",
     }
-    for row in by_split(found.only("split", scores.order_splits(found.rows)[:1]).rows):
-        if row.metric == "cd_point":
+    for row in by_split(found.rows):
+        if row.metric == "cd_point" and row.split == found.rows[0].split:
             facts[f"cd_point, {row.method}, {row.outfit}"] = f"{row.value * 1e4:.3f} x 1e-4 m²"
     return facts
 

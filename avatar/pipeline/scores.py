@@ -93,10 +93,7 @@ def scores_file(folder: Path, split: str) -> Path:
 
 @prepared_process()
 def predict(config: PredictConfig) -> list[Path]:
-    """Predicts every outfit of a run; gives the folders of point clouds.
-
-    A motion is refused by a `DataError` where an outfit has only a mesh of its body.
-    """
+    """Predicts every outfit of a run; gives the folders of point clouds. A motion needs bodies that can be posed."""
     avatar = load_avatar(config.run, config.checkpoint, config.device)
     folders = []
     for outfit in run_outfits(avatar, config.data_root):
@@ -124,9 +121,8 @@ def predicted_fps(folder: Path) -> float:
 def evaluate(config: EvaluateConfig) -> Scores:
     """Scores runs, or a foreign program's predictions, beside their floors; prints the tables.
 
-    Each run's scores go to ``<run>/scores.csv``, the floors to `floors_folder`; those on another split than test to
-    ``scores.<split>.csv``. The ledger of each folder keeps what was measured: what is unchanged (predictions, data,
-    settings, and the code of the metrics) is not measured again.
+    Each run's scores go to its `scores_file`, the floors to that in `floors_folder`. Ledgers there keep what was
+    measured: what is unchanged (predictions, data, settings, and the code of the metrics) is not measured again.
     """
     scores = score_runs(config) if config.predictions is None else score_foreign(config, config.predictions)
     print("\n".join(map(to_markdown, score_tables(scores.rows))))
@@ -147,16 +143,13 @@ def score_foreign(config: EvaluateConfig, folder: Path) -> Scores:
 
 
 def score_runs(config: EvaluateConfig) -> Scores:
-    """Scores every outfit of every run, and its floors at the point count that most of the runs predict.
-
-    Predictions that are missing are refused before anything is scored.
-    """
+    """Scores every outfit of every run, and its floors at the point count that most runs predict."""
     scores, floors, split = Scores(), {}, config.split
     avatars = {run: load_avatar(run) for run in config.runs}
     runs = [(run, avatar, run_outfits(avatar, config.data_root)) for run, avatar in avatars.items()]
     for run, _, outfits in runs:
         for outfit in outfits:
-            find_predictions(predictions_folder(run, split, outfit.name), outfit.frames(split))
+            find_predictions(predictions_folder(run, split, outfit.name), outfit.frames(split))  # before any is scored
     for run, avatar, outfits in runs:
         mine, label = Scores(), label_of(avatar, split=split)
         with lock_folder(run / "predictions", wait=True):
@@ -204,18 +197,15 @@ def variant_of(config: RunConfig) -> str:
 
 
 def floors_root(run: Path, settings: RunConfig) -> Path:
-    """Where the floors of a run's outfits go: the root that it lies in, or its own folder if it was moved.
-
-    What a run's file says of its root is the word of whoever made it, and is believed only where it is true.
-    """
+    """Where the floors of a run's outfits go: the root that its file names, if it lies there, else its own folder."""
     return settings.runs_root if settings.folder.resolve() == run.resolve() else run
 
 
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
     """The sampling floor and the bare body for one outfit at a point count, kept in a file for the next method.
 
-    Metrics that the file has already stay in it where they were made with the same points, seed, scanner, data and
-    code. Two processes that want the same floors score them once: the second waits for the first.
+    Metrics that the file has of the same points, seed, scanner, data and code stay in it. Another process that wants
+    the same floors waits for them.
     """
     memory = scoring.remember_points(None, "floors", outfit, config.split, config.score, points=points)
     key = digest_of([memory.made_of(name) for name in outfit.frames(config.split)])
@@ -259,19 +249,14 @@ def are_current(path: Path) -> bool:
 
 
 def score_tables(rows: Sequence[Score]) -> list[Table]:
-    """Every metric of every outfit and split, test first, and the excess over the sampling floor if it was scored."""
+    """Every metric of every outfit, split by split, and the excess over the sampling floor where it was scored."""
     found = []
-    for split in order_splits(rows):
+    for split in dict.fromkeys(row.split for row in rows):
         mine = by_split(row for row in rows if row.split == split)
         found += [metric_table(mine, outfit) for outfit in dict.fromkeys(row.outfit for row in mine)]
         if ("sampling", "cd_point") in {(row.method, row.metric) for row in mine}:
             found.append(outfit_table(mine, "cd_point", View.EXCESS))
     return found
-
-
-def order_splits(rows: Iterable[Score]) -> list[str]:
-    """The splits of some scores, test first."""
-    return sorted({row.split for row in rows}, key=lambda split: (split != "test", split))
 
 
 def current_commit() -> str:

@@ -1,11 +1,8 @@
-"""`seams`: how runs predict near the cuts of the body's UV atlas: jumps across them, and errors by distance to them.
-
-POP's features jump there and a surface's do not.
-"""
+"""`seams`: how runs predict near the cuts of the body's UV atlas, where POP's features jump and a surface's do not."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
@@ -77,10 +74,8 @@ class EdgeSides(NamedTuple):
 
 
 class PointErrors(NamedTuple):
-    """How far single predicted points are off a scan.
-
-    ``distance (N,)`` metres to the tangent plane at the nearest scan point, which does not count the scan's spacing;
-    ``angle (N,)`` degrees to its normal; ``clothed (N,)``, on a garment where the scan knows, else all true.
+    """How far predicted points are off a scan, ``(N,)`` each: metres to the tangent plane at the nearest scan point, which
+    do not count the scan's spacing, degrees to its normal, and which are on a garment, where the scan knows.
     """
 
     distance: np.ndarray
@@ -90,10 +85,8 @@ class PointErrors(NamedTuple):
 
 @dataclass(frozen=True)
 class SeamPlaces:
-    """Places on a body where predictions are asked for.
-
-    ``spread`` points with their seam ``distances (N,)``, metres; both sides of the atlas's ``seams`` and of as many
-    ``others`` of the body's edges.
+    """Places on a body where predictions are asked for: ``spread`` points with their seam ``distances (N,)``, metres,
+    and both sides of the atlas's ``seams`` and of as many ``others`` of the body's edges.
     """
 
     spread: SurfaceSamples
@@ -126,42 +119,30 @@ class SeamKey(NamedTuple):
         return f"{self.metric.replace('_', ' ')}{place} ({SHOWN[UNITS[self.metric]][0]})"
 
 
-class FrameMean(NamedTuple):
-    """A metric's mean over some points of one frame, NaN without any, and their count."""
-
-    mean: float
-    points: int
+KEYS = tuple(SeamKey(metric, BODY, *band) for band in pairwise(LIMITS) for metric in ("distance", "angle"))
+KEYS += tuple(SeamKey(metric, where) for where in (SEAMS, OTHERS) for metric in ("jump", "normal_jump"))
 
 
-@dataclass(frozen=True)
-class SeamTest:
-    """One run's seam test on one outfit, frame by frame, in the same order for all runs."""
+class SeamTest(NamedTuple):
+    """One run's seam test on one outfit: ``sums (F, K, 2)`` of `KEYS` and the points in them, frame by frame."""
 
     label: Label
     dataset: str
     outfit: str
-    frames: tuple[dict[SeamKey, FrameMean], ...]
-
-    @property
-    def name(self) -> str:
-        """The run in tables."""
-        return name_of(self.label)
-
-    def mean(self, key: SeamKey) -> FrameMean:
-        """A metric over the points of all frames."""
-        return pooled(frame[key] for frame in self.frames)
+    sums: np.ndarray
 
 
 @prepared_process()
 def seams(config: SeamsConfig) -> Path:
     """Writes ``<out>/<table>.csv`` and ``<table>.md``, which it prints; gives the path of the latter.
 
-    Refuses before anything is measured: no runs, implicit ones, a baseline that is none of them; and bodies without UV
-    coordinates.
+    Refuses before anything is measured: no runs, implicit ones, a baseline that is none of them.
     """
     asked, every, tables = runs_by_outfit(config), [], []
     for mine in asked if config.baseline else ():
-        check_baseline([name_of(label_of(avatar)) for avatar, _ in mine], config.baseline)
+        names = [name_of(label_of(avatar)) for avatar, _ in mine]
+        if config.baseline not in names:
+            raise unknown_name("baseline", config.baseline, names)
     for mine in asked:
         places = seam_places(mine[0][1].template, config.points, config.seed)
         tests = [probe_seams(config, avatar, outfit, places) for avatar, outfit in mine]
@@ -193,12 +174,12 @@ def runs_by_outfit(config: SeamsConfig) -> list[list[tuple[TrainedAvatar, Outfit
 def probe_seams(config: SeamsConfig, avatar: TrainedAvatar, outfit: Outfit, places: SeamPlaces) -> SeamTest:
     """A run asked at places of an outfit's body, for the frames of a split."""
     names = spaced_frames(list(outfit.frames(config.split)), config.frames)
-    frames = []
+    sums = []
     for name in tracked(names, f"seams of {avatar.config.method.variant} on {outfit.name}"):
         frame = outfit.load(config.split, name)
         cloud = avatar.method.predict_at(avatar, outfit.name, frame.body, places.samples)
-        frames.append(measure_seams(cloud, frame.scan, places))
-    return SeamTest(label_of(avatar, table=config.table), outfit.dataset, outfit.name, tuple(frames))
+        sums.append(measure_seams(cloud, frame.scan, places))
+    return SeamTest(label_of(avatar, table=config.table), outfit.dataset, outfit.name, np.array(sums))
 
 
 def edge_sides(faces: Tensor, edges: Tensor) -> EdgeSides:
@@ -264,34 +245,27 @@ def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arcsin(np.clip(half, 0, 1)))
 
 
-def measure_seams(cloud: PointCloud, scan: Scan, places: SeamPlaces) -> dict[SeamKey, FrameMean]:
-    """Errors by seam distance, and jumps at seams and other edges, of one frame predicted at the places.
-
-    Only predictions that end on cloth count, where the scan knows what is.
-    """
+def measure_seams(cloud: PointCloud, scan: Scan, places: SeamPlaces) -> np.ndarray:
+    """Sums of the `KEYS` over the predictions that end on cloth, and their counts, ``(K, 2)``, of one frame."""
     count, seams, others = len(places.distances), len(places.seams.left.face_ids), len(places.others.left.face_ids)
     if len(cloud.points) != count + 2 * (seams + others):
         raise AvatarError(f"cloud: expected a point for each place, got {len(cloud.points)}.")
-    errors, values = point_errors(cloud, scan), {}
-    bands = np.digitize(places.distances, LIMITS) - 1
-    for band, (low, high) in enumerate(pairwise(LIMITS)):
+    errors, bands, values = point_errors(cloud, scan), np.digitize(places.distances, LIMITS) - 1, []
+    for band in range(len(LIMITS) - 1):
         mine = (bands == band) & errors.clothed[:count]
-        values[SeamKey("distance", BODY, low, high)] = errors.distance[:count][mine]
-        values[SeamKey("angle", BODY, low, high)] = errors.angle[:count][mine]
-    for where, start, size in ((SEAMS, count, seams), (OTHERS, count + 2 * seams, others)):
+        values += [errors.distance[:count][mine], errors.angle[:count][mine]]
+    for start, size in ((count, seams), (count + 2 * seams, others)):
         left, right = slice(start, start + size), slice(start + size, start + 2 * size)
-        clothed = errors.clothed[left]
         jumps = np.linalg.norm(cloud.points[left] - cloud.points[right], axis=1)
-        values[SeamKey("jump", where)] = jumps[clothed]
-        values[SeamKey("normal_jump", where)] = angles_between(cloud.normals[left], cloud.normals[right])[clothed]
-    return {key: FrameMean(float(v.mean()) if len(v) else float("nan"), len(v)) for key, v in values.items()}
+        turns = angles_between(cloud.normals[left], cloud.normals[right])
+        values += [jumps[errors.clothed[left]], turns[errors.clothed[left]]]
+    return np.array([(value.sum(), len(value)) for value in values])
 
 
-def pooled(means: Iterable[FrameMean]) -> FrameMean:
-    """The mean over the points of several frames or bands."""
-    means = [mean for mean in means if mean.points]
-    points, total = sum(mean.points for mean in means), sum(mean.mean * mean.points for mean in means)
-    return FrameMean(total / points if points else float("nan"), points)
+def mean_of(sums: np.ndarray) -> float:
+    """The mean over the points of several frames or keys, ``(..., 2)`` sums and counts; NaN without any."""
+    total, points = sums.reshape(-1, 2).sum(axis=0)
+    return float(total / points) if points else float("nan")
 
 
 def name_of(label: Label) -> str:
@@ -299,20 +273,14 @@ def name_of(label: Label) -> str:
     return named(label.method, label.variant, f"seed {label.seed}" if label.seed else "")
 
 
-def check_baseline(names: Sequence[str], baseline: str) -> None:
-    """Refuses a baseline that is none of the runs in a table."""
-    if baseline not in names:
-        raise unknown_name("baseline", baseline, names)
-
-
 def seams_csv(tests: Sequence[SeamTest]) -> str:
     """Every mean as a tidy row, in metres and degrees; distances from seams in metres."""
     rows = []
     for test in tests:
-        shared = asdict(test.label) | {"dataset": test.dataset, "outfit": test.outfit, "frames": len(test.frames)}
-        for key in test.frames[0]:
-            mean = test.mean(key)
-            row = shared | key._asdict() | {"value": mean.mean, "points": mean.points, "unit": UNITS[key.metric]}
+        shared = asdict(test.label) | {"dataset": test.dataset, "outfit": test.outfit, "frames": len(test.sums)}
+        for key, sums in zip(KEYS, test.sums.swapaxes(0, 1)):
+            measured = {"value": mean_of(sums), "points": int(sums[:, 1].sum()), "unit": UNITS[key.metric]}
+            row = shared | key._asdict() | measured
             rows.append([row[column] for column in COLUMNS])
     return csv_text(COLUMNS, rows)
 
@@ -320,29 +288,30 @@ def seams_csv(tests: Sequence[SeamTest]) -> str:
 def seam_table(tests: Sequence[SeamTest]) -> Table:
     """One outfit's tests: metrics by distance to the seam, and jumps, down; runs across."""
     body = []
-    for key in tests[0].frames[0]:
-        values = [test.mean(key).mean * SHOWN[UNITS[key.metric]][1] for test in tests]
+    for place, key in enumerate(KEYS):
+        values = [mean_of(test.sums[:, place]) * SHOWN[UNITS[key.metric]][1] for test in tests]
         body.append(TableRow(key.label, tuple(v if np.isfinite(v) else None for v in values)))
-    return Table(f"{tests[0].outfit}: seams", "where", tuple(test.name for test in tests), tuple(body), NOTES)
+    names = tuple(name_of(test.label) for test in tests)
+    return Table(f"{tests[0].outfit}: seams", "where", names, tuple(body), NOTES)
 
 
-def seam_differences(tests: Sequence[SeamTest], baseline: str, confidence: float = 0.95) -> Table:
+def seam_differences(tests: Sequence[SeamTest], baseline: str) -> Table:
     """One outfit's tests less the baseline's at the same places, near seams and far, with intervals over frames."""
-    names = [test.name for test in tests]
-    check_baseline(names, baseline)
-    base, others = tests[names.index(baseline)], [test for test in tests if test.name != baseline]
+    others = {name_of(test.label): test for test in tests}
+    base = others.pop(baseline)
 
-    def paired(test: SeamTest, keys: Sequence[SeamKey]) -> Interval:
+    def paired(test: SeamTest, places: Sequence[int]) -> Interval:
         """The mean over frames of what a run and the baseline differ by, over the points of some bands."""
-        values = [[pooled(frame[key] for key in keys).mean for frame in each.frames] for each in (test, base)]
+        values = [[mean_of(sums[places]) for sums in each.sums] for each in (test, base)]
         differences = np.subtract(*values)
-        return bootstrap_mean([differences[np.isfinite(differences)]], confidence=confidence)
+        return bootstrap_mean([differences[np.isfinite(differences)]])
 
     body, near = [], f"{100 * LIMITS[1]:g} cm"
     for metric in ("distance", "angle"):
         unit, scale = SHOWN[UNITS[metric]]
-        keys = [key for key in base.frames[0] if (key.metric, key.where) == (metric, BODY)]
-        for where, mine in ((f"nearer than {near}", keys[:1]), (f"farther than {near}", keys[1:])):
-            body.append(interval_row(f"{metric}, {where} ({unit})", [paired(test, mine) for test in others], scale))
-    note = f"Differences to {baseline} with {100 * confidence:g}% intervals: percentile bootstrap over frames, paired."
-    return Table(f"{base.outfit}: seams, difference", "where", tuple(t.name for t in others), tuple(body), (note,))
+        places = [place for place, key in enumerate(KEYS) if key.metric == metric]
+        for where, mine in ((f"nearer than {near}", places[:1]), (f"farther than {near}", places[1:])):
+            intervals = [paired(test, mine) for test in others.values()]
+            body.append(interval_row(f"{metric}, {where} ({unit})", intervals, scale))
+    note = f"Differences to {baseline} with 95% intervals: percentile bootstrap over frames, paired."
+    return Table(f"{base.outfit}: seams, difference", "where", tuple(others), tuple(body), (note,))

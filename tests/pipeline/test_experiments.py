@@ -79,15 +79,15 @@ def test_a_job_leaves_predictions_and_scores_with_what_tells_it_apart(jobs):
 
 
 def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatch, change_source):
-    run, drawn, real = jobs[1].run.folder, [], scoring.draw_scan
-    monkeypatch.setattr(scoring, "draw_scan", lambda frame, config: drawn.append(frame.name) or real(frame, config))
+    run, read, real = jobs[1].run.folder, [], scoring.read_points
+    monkeypatch.setattr(scoring, "read_points", lambda path: read.append(path.name) or real(path))
     (run / "scored.txt").write_text("of an older version: not believed")
 
     def again(job: ExperimentConfig) -> int:
         """How many predictions the job scores."""
-        drawn.clear()
+        read.clear()
         experiment(job)
-        return len(drawn)
+        return len(read)
 
     cloud = run / "predictions" / "test" / "tiny" / "check.00000.ply"
     before = {path: path.read_bytes() for path in (cloud, run / "avatar.safetensors", run / "scores.csv")}
