@@ -77,8 +77,8 @@ VERBS = {
     ),
     "compare": Verb(
         "makes one table of many runs' scores",
-        "avatar.pipeline.comparison:compare",
-        "avatar.pipeline.comparison:CompareConfig",
+        "avatar.pipeline.reporting:compare",
+        "avatar.pipeline.reporting:CompareConfig",
         options="table runs runs_root dataset name methods metrics baseline pictures splits data_root out",
     ),
     "seams": Verb(

@@ -27,8 +27,7 @@ from avatar.methods.points import check_count
 from avatar.methods.registry import find_method
 from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.pipeline.canonicalization import canonicalize, check_scored, score_canonical_scans
-from avatar.pipeline.comparison import CompareConfig, compare
-from avatar.pipeline.reporting import ReportConfig, report
+from avatar.pipeline.reporting import CompareConfig, ReportConfig, compare, report
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict, scores_file
 from avatar.pipeline.surfaces import MeshConfig, mesh
 from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer

@@ -74,8 +74,8 @@ class EdgeSides(NamedTuple):
 
 
 class PointErrors(NamedTuple):
-    """How far predicted points are off a scan, ``(N,)`` each: metres to the tangent plane at the nearest scan point, which
-    do not count the scan's spacing, degrees to its normal, and which are on a garment, where the scan knows.
+    """How far predicted points are off a scan, ``(N,)`` each: metres to the tangent plane at the nearest scan point, so
+    that its spacing does not count, degrees to its normal, and whether that is on a garment, where the scan knows.
     """
 
     distance: np.ndarray

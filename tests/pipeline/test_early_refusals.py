@@ -15,8 +15,8 @@ from avatar.methods.canonicalizer import CanonicalizeConfig
 from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.pipeline import canonicalization, experiments, scores
 from avatar.pipeline.canonicalization import canonicalize
-from avatar.pipeline.comparison import CompareConfig
 from avatar.pipeline.experiments import DemoConfig, ExperimentConfig, demo, experiment, has_baseline
+from avatar.pipeline.reporting import CompareConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.runs.training import train as train_run
 from avatar.simulate.recording import SimulateConfig

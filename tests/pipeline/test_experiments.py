@@ -22,8 +22,8 @@ from avatar.evaluation.tables import Axis, FormConfig, ReportedTable
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
 from avatar.methods.settings import MethodChoice
-from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.experiments import ExperimentConfig, experiment, tabulate_experiment
+from avatar.pipeline.reporting import CompareConfig, compare
 
 ROOT = Path(__file__).parents[2]
 METRICS = ("cd_point", "normal_l1")
