@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 
-from avatar.evaluation.scoring import ScoreConfig
 from avatar.evaluation.report import Picture, PictureRow
+from avatar.evaluation.scoring import ScoreConfig
 from avatar.pipeline.outcomes import find_ending
 from avatar.pipeline.reporting import ReportConfig, picture_sheet, report
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
