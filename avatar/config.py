@@ -182,7 +182,7 @@ def run_job(
         if not several or (state is State.stopped and os.getpid() == parent):
             sys.exit(code)
 
-    if several and outcomes.is_stopping(journal):
+    if several and (journal / outcomes.STOP).exists():
         return end(State.stopped, "not begun.", STOPPED)
     if several and current_world().size > 1:
         return end(State.failed, "torchrun trains one run; leave out either it or --multirun.", 2)

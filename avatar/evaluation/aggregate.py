@@ -154,9 +154,8 @@ def paired_differences(frames: Iterable[FrameScore], metric: str, first: str, se
 def bootstrap_mean(
     groups: Iterable[Sequence[float]], resamples: int = 2000, confidence: float = 0.95, seed: int = 0
 ) -> Interval:
-    """The mean of all values with its percentile bootstrap interval; values are redrawn within their group.
-
-    They count as independent: true of settled poses; for neighbours in a motion the interval is too narrow.
+    """The mean of all values with its percentile bootstrap interval; values are redrawn within their group. They count
+    as independent: true of settled poses; for neighbours in a motion the interval is too narrow.
     """
     groups = [np.asarray(values, np.float64) for values in groups]
     count = sum(map(len, groups))
@@ -170,9 +169,8 @@ def bootstrap_mean(
 def compare_methods(
     scores: Scores, metric: str, baseline: str, resamples: int = 2000, confidence: float = 0.95
 ) -> list[Difference]:
-    """Differences of every method to the baseline, paired by frame: for each outfit, then for all together.
-
-    A method's baseline is that of its own variant where there is one, else the plain or the only one.
+    """Differences of every method to the baseline, paired by frame: for each outfit, then for all together. A method's
+    baseline is that of its own variant where there is one, else the plain or the only one.
     """
     frames = [row for row in scores.frames if row.metric == metric]
     methods = order_methods({method_key(row) for row in frames})

@@ -37,12 +37,11 @@ SURFACE_POINTS = 2_000  # canonical points a frame whose distance to the true su
 @dataclass(frozen=True)
 class Canonicalized:
     """A frame's canonical ``scan``, and ``forward_weights (M, J)`` at its points, which pose it again: does it close?
-
     They are the forward field g^c, or the weights of the nearest vertices of the body at rest.
     """
 
     scan: CanonicalScan
-    forward_weights: np.ndarray | None = None
+    forward_weights: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -112,9 +111,8 @@ def _posed_from_canonical(weights: np.ndarray, body: BodyFit, template: Template
 
 
 class CanonicalComparison:
-    """What a metric sees of one canonicalized frame: errors of its kept points, in metres, float64.
-
-    ``surfaces`` are the true ones at rest, a mesh a label. Indices into another scan than the frame's are refused.
+    """What a metric sees of one canonicalized frame: errors of its kept points, in metres, float64. ``surfaces`` are
+    the true ones at rest, a mesh a label. Indices into another scan than the frame's are refused.
     """
 
     def __init__(
@@ -145,10 +143,8 @@ class CanonicalComparison:
 
     @cached_property
     def off_cycle(self) -> np.ndarray:
-        """Distance of each point to itself when reposed with the weights of where it is, ``(N,)``; else empty."""
+        """Distance of each point to itself when reposed with the weights of where it is, ``(N,)``."""
         scan, weights = self.result.scan, self.result.forward_weights
-        if weights is None:
-            return np.empty(0)
         check_shape("forward_weights", weights, "N J", N=len(scan.points), J=len(self.template.parents))
         back = repose(scan.points, weights, self.frame.body, self.template)
         return np.linalg.norm(back - self.frame.scan.points[scan.source].astype(np.float64), axis=1)
@@ -187,7 +183,7 @@ class CanonicalComparison:
 def _over(part: str, errors: str, reduce: Callable[[np.ndarray], float], scale: float, c: CanonicalComparison) -> float:
     """One of a comparison's errors, where it is known, over one part of its points; NaN without any."""
     values = getattr(c, errors)
-    if len(values) and part != "all":
+    if part != "all":
         values = values[getattr(c.truth, part)[c.result.scan.source]]
     values = values[np.isfinite(values)]
     return scale * float(reduce(values)) if len(values) else np.nan
@@ -241,14 +237,11 @@ def score_canonicalization(
     ledger: Ledger | None = None,
     made_by: Mapping[Label, str] | None = None,
 ) -> Scores:
-    """Every metric of some frames for several canonicalizations, and for the true weights beside them.
-
-    ``methods`` are labels and what each makes of a frame as the simulated outfit loads it. With a ledger only new or
-    changed values are measured; ``made_by`` is a hash of all that each method's scans depend on but the data. Raises
-    `AvatarError` naming the frame, for data without truth or a scan that is not the frame's.
+    """Every metric of some frames for several canonicalizations, and for the true weights beside them. ``methods`` are
+    labels and what each makes of a frame as the simulated outfit loads it. With a ledger only new or changed values are
+    measured; ``made_by`` is a hash of all that each method's scans depend on but the data. Raises `AvatarError` naming
+    the frame, for data without truth or a scan that is not the frame's.
     """
-    if not methods or not names:
-        raise AvatarError(f"methods, names: expected at least one each, got {len(methods)} and {len(names)}.")
     surfaces, truths = canonical_surfaces(outfit, split, names[0]), {}
     first = next(iter(methods))
     shared = first.variant if len({label.variant for label in methods}) == 1 else ""

@@ -27,11 +27,10 @@ HOLE = 0.01  # metres of the true surface to the predicted one from which on it 
 
 
 class Comparison:
-    """What a metric sees of one frame: checked, in float64, neighbours searched once for all metrics.
-
-    ``points (N, 3)`` and ``normals (N, 3)`` of the prediction, ``scan (M, 3)`` and ``scan_normals (M, 3)``, float64
-    on the CPU, normals scaled to length one. ``mesh`` is the predicted mesh where there is one, ``body`` the posed
-    bare body. Raises `AvatarError` on an empty cloud, wrong shapes, non-finite numbers or normals without direction.
+    """What a metric sees of one frame: checked, in float64, neighbours searched once for all metrics. ``points (N, 3)``
+    and ``normals (N, 3)`` of the prediction, ``scan (M, 3)`` and ``scan_normals (M, 3)``, float64 on the CPU, normals
+    scaled to length one. ``mesh`` is the predicted mesh where there is one, ``body`` the posed bare body. Raises
+    `AvatarError` on an empty cloud, wrong shapes, non-finite numbers or normals without direction.
     """
 
     def __init__(self, prediction: PointCloud, scan: Scan, body: Mesh | None = None, mesh: Mesh | None = None):
@@ -48,6 +47,12 @@ class Comparison:
     def point_of_scan(self) -> Tensor:
         """Index of the nearest predicted point to each scan point, ``(M,)``."""
         return nearest(self.scan[None], self.points[None])[0]
+
+    @property
+    def gaps(self) -> tuple[Tensor, Tensor]:
+        """Distances of predicted ``(N,)`` and of scan points ``(M,)`` to the nearest of the other cloud, metres."""
+        to_scan = (self.points - self.scan[self.scan_of_point]).norm(dim=-1)
+        return to_scan, (self.scan - self.points[self.point_of_scan]).norm(dim=-1)
 
     @cached_property
     def spacing(self) -> float:
@@ -70,9 +75,7 @@ class Comparison:
 
     @cached_property
     def depths(self) -> Tensor:
-        """How deep predicted points lie under the bare body, positive inside; at most `PENETRATION_POINTS` of them, an
-        even stride through the prediction.
-        """
+        """How deep `PENETRATION_POINTS` or fewer predicted points, an even stride, lie under the bare body, metres."""
         if self.body is None:
             raise AvatarError(
                 "body: penetration needs the posed bare body and its faces, and none was given; load frames from a "
@@ -122,9 +125,8 @@ ACCELERATION = Unit("m/frame^2", 1e3, "mm/frame²")
 
 @dataclass(frozen=True)
 class Metric:
-    """A named number: values are kept in ``unit`` and shown as ``value * scale`` in ``shown_in``.
-
-    ``measure`` takes a `Comparison`, or, for a ``sequential`` metric, corresponding points ``(T, N, 3)``.
+    """A named number: values are kept in ``unit`` and shown as ``value * scale`` in ``shown_in``. ``measure`` takes a
+    `Comparison`, or, for a ``sequential`` metric, corresponding points ``(T, N, 3)``.
     """
 
     name: str
@@ -219,9 +221,8 @@ def scan_to_surface(c: Comparison) -> Tensor:
 
 
 def scan_to_discs(scan: Tensor, points: Tensor, normals: Tensor, point_of_scan: Tensor, radius: float) -> Tensor:
-    """Distances from scan points to the disc at their nearest predicted point, ``(M,)`` metres.
-
-    A point cloud's surface for D_s2m: planes would hide holes, bare points count their own spacing as error.
+    """Distances from scan points to the disc at their nearest predicted point, ``(M,)`` metres. A point cloud's surface
+    for D_s2m: planes would hide holes, bare points count their own spacing as error.
     """
     away = scan - points[point_of_scan]
     height = (away * normals[point_of_scan]).sum(dim=-1)
@@ -247,26 +248,17 @@ def f_score_5mm(c: Comparison) -> Tensor:
     """F-score at 5 mm: harmonic mean of the share of predicted points within 5 mm of a scan point and the share of
     scan points within 5 mm of a predicted point. Higher is better.
     """
-    return _f_score(c, 5e-3)
+    return f_score(*c.gaps, 5e-3)
 
 
 @metric("f_score_1cm", PERCENT, higher_is_better=True)
 def f_score_1cm(c: Comparison) -> Tensor:
     """F-score at 1 cm: as f_score_5mm, within 1 cm. Higher is better."""
-    return _f_score(c, 1e-2)
-
-
-def _f_score(c: Comparison, threshold: float) -> Tensor:
-    to_scan = (c.points - c.scan[c.scan_of_point]).norm(dim=-1)
-    to_points = (c.scan - c.points[c.point_of_scan]).norm(dim=-1)
-    return f_score(to_scan, to_points, threshold)
+    return f_score(*c.gaps, 1e-2)
 
 
 def f_score(to_scan: Tensor, to_points: Tensor, threshold: float) -> Tensor:
-    """Harmonic mean of the shares of predicted and of scan points that have the other within a threshold.
-
-    ``to_scan (N,)`` and ``to_points (M,)`` are distances to the nearest point of the other cloud, metres.
-    """
+    """Harmonic mean of the shares of predicted ``(N,)`` and of scan ``(M,)`` distances within a threshold, metres."""
     precision = (to_scan <= threshold).double().mean()
     recall = (to_points <= threshold).double().mean()
     return 2 * precision * recall / (precision + recall).clamp(min=1e-12)
@@ -287,13 +279,18 @@ def normal_maps_apart(c: Comparison) -> Tensor:
     """Mean angle between rendered normal maps of prediction and scan where both are seen, six views 60° apart from 20°
     above the horizon, 192 x 192 pixels; points are discs as wide as evenly spread ones need to close.
     """
-    return shapes.normal_map_error(*c.normal_maps)
+    mine, theirs = c.normal_maps
+    both = mine.any(dim=-1) & theirs.any(dim=-1)
+    if not both.any():
+        return mine.new_tensor(180.0)
+    return torch.rad2deg((mine[both] * theirs[both]).sum(dim=-1).clamp(-1, 1).acos()).mean()
 
 
 @metric("silhouette", PERCENT, higher_is_better=True)
 def silhouettes_shared(c: Comparison) -> Tensor:
     """Silhouette overlap in the views of normal_map: intersection over union, all views together. Higher is better."""
-    return shapes.silhouette_overlap(*c.normal_maps)
+    mine, theirs = (maps.any(dim=-1) for maps in c.normal_maps)
+    return (mine & theirs).sum().double() / (mine | theirs).sum().clamp(min=1)
 
 
 @metric("holes", PERCENT)

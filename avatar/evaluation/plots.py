@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 LOG_COLUMNS = ("split", "step", "epoch", "seconds")
 INK = "#010203"  # stands for the page's text colour, which inline_svg puts in its place
 COLOURS = ("#3b7dd8", "#e07a3f", "#3fa37c", "#b65fc2", "#c9a227", "#d1495b", "#5b8c9e", "#8a8f98")
-PANEL = (3.6, 2.3)  # inches
 
 
 def plot_losses(metrics_csv: str | Path) -> Figure:
@@ -60,9 +59,8 @@ def plot_outfits(rows: Sequence[Score], metric: str) -> Figure:
 
 
 def plot_fractions(rows: Sequence[Score], metric: str) -> Figure:
-    """The mean over frames of one metric against the share of the training frames, a line a method.
-
-    Floors that were not trained are level lines.
+    """The mean over frames of one metric against the share of the training frames, a line a method. Floors that were
+    not trained are level lines.
     """
     (known,) = find_metrics([metric])
     groups = grouped(grouped(aggregate.rows_of(rows, [metric]), method_key).values(), lambda mine: mine[0].method)
@@ -99,7 +97,6 @@ def plot_times(rows: Sequence[Score], metric: str) -> Figure:
 
 def plot_progress(logs: Mapping[str, Mapping[str, Path]]) -> Figure:
     """Chamfer distance on held-back training frames against the minutes trained: a panel an outfit, a line a method.
-
     ``logs`` are training logs by outfit and method; those that never validated a Chamfer distance draw no line.
     """
     figure, panels = make_panels(len(logs))
@@ -123,16 +120,9 @@ def _finish(figure: Figure, panels: Sequence[Axes], across: str = "", up: str = 
     return figure
 
 
-def save_figure(figure: Figure, path: str | Path) -> None:
-    """Writes a figure as the kind of file its name says: png, svg or pdf."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(Path(path), dpi=150, facecolor="white")
-
-
 def inline_svg(figure: Figure, prefix: str, title: str) -> str:
-    """A figure as one ``<svg>`` element for an HTML page, drawn in the page's text colour on its background.
-
-    ``prefix`` is put before all ids, which must be unique in a page; ``title`` is plain text for screen readers.
+    """A figure as one ``<svg>`` element for an HTML page, drawn in the page's text colour on its background. ``prefix``
+    is put before all ids, which must be unique in a page; ``title`` is plain text for screen readers.
     """
     text = io.StringIO()
     style = {"svg.fonttype": "none", "svg.hashsalt": prefix, "font.family": "sans-serif"}
@@ -149,9 +139,8 @@ def inline_svg(figure: Figure, prefix: str, title: str) -> str:
 
 
 def read_curves(path: Path, against: str = "step") -> dict[str, dict[str, list[tuple[float, float]]]]:
-    """A training log as term to split to (step or seconds, value) points.
-
-    Raises `DataError` when the log is missing, lacks a column, or holds no number.
+    """A training log as term to split to (step or seconds, value) points. Raises `DataError` when the log is missing,
+    lacks a column, or holds no number.
     """
     if not path.is_file():
         raise DataError(path, "there is no training log here.", "Train first.")
@@ -177,7 +166,7 @@ def make_panels(count: int, size: tuple[float, float] | None = None) -> tuple[Fi
     """A figure with panels in rows of three, in the house's style."""
     columns = min(3, count)
     rows = -(-count // columns)
-    size = size or (PANEL[0] * max(columns, 2), PANEL[1] * rows + 0.3)
+    size = size or (3.6 * max(columns, 2), 2.3 * rows + 0.3)  # inches
     figure = require("matplotlib.figure").Figure(figsize=size, layout="constrained")
     panels = [figure.add_subplot(rows, columns, place + 1) for place in range(count)]
     for panel in panels:

@@ -19,7 +19,6 @@ from avatar.evaluation.tables import Table
 from avatar.io.npz import write_whole
 
 COLUMNS = ("ground truth", "prediction", "template", "mesh", "error")
-WEBP = {"format": "WEBP", "quality": 90, "method": 4}
 STYLE = """
 :root { color-scheme: light dark; --page: #f6f6f3; --card: #fff; --ink: #1c2027; --soft: #646b76; --line: #e2e2dd;
   --accent: #2f6fc9; --missing: #9a6a12; --paper: #fff; }
@@ -117,7 +116,7 @@ class PictureRow:
 
 @dataclass(frozen=True)
 class ReportContent:
-    """What a report shows. Whatever is left empty is said to be missing on the page, never skipped."""
+    """What a report shows; pictures, tables and a training log that are not there are called missing on the page."""
 
     title: str
     subtitle: str = ""
@@ -126,29 +125,28 @@ class ReportContent:
     config_yaml: str = ""
     metrics_csv: Path | None = None
     tables: tuple[Table, ...] = ()
-    columns: tuple[str, ...] = COLUMNS
     pictures: tuple[PictureRow, ...] = ()
     files: tuple[Path, ...] = ()
 
 
 def write_report(run_folder: str | Path, content: ReportContent) -> Path:
-    """Writes ``report.html`` into a run's folder and returns its path.
-
-    Raises `AvatarError` when a picture is not an image, or a row has another number of pictures than columns, and
-    `DataError` when the training log is there and cannot be read.
+    """Writes ``report.html`` into a run's folder and returns its path. Raises `AvatarError` when a picture is not an
+    image, or a row has another number of pictures than columns, and `DataError` when the training log is there and
+    cannot be read.
     """
-    folder, text, log = Path(run_folder), content.config_yaml, content.metrics_csv
-    files = "".join(_file(folder, Path(file)) for file in content.files)
+    folder, log = Path(run_folder), content.metrics_csv
     training = _missing(f"No training log{f' at {log}' if log else ''}, so there are no loss curves.")
     if log and Path(log).is_file():
         training = f'<div class="plot">{inline_svg(plot_losses(log), "losses", "Loss terms over training steps")}</div>'
+    paragraphs = [f"<p>{escape(part)}</p>" for part in content.summary.split("\n\n")]
+    facts = [f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in content.facts.items()]
     sections = {
-        "Summary": _summary(content) or _missing("No summary was given."),
+        "Summary": f'{"".join(paragraphs)}\n<dl class="facts">{"".join(facts)}</dl>',
         "Pictures": _pictures(content) if content.pictures else _missing("No pictures were made for this run."),
         "Metrics": _metrics(content),
         "Training": training,
-        "Configuration": f"<pre>{escape(text)}</pre>" if text.strip() else _missing("No configuration was recorded."),
-        "Files": f'<ul class="files">{files}</ul>' if files else _missing("This run made no files."),
+        "Configuration": f"<pre>{escape(content.config_yaml)}</pre>",
+        "Files": f'<ul class="files">{"".join(_file(folder, Path(file)) for file in content.files)}</ul>',
     }
     page = PAGE.substitute(
         title=escape(content.title),
@@ -172,7 +170,7 @@ def picture_source(image: np.ndarray) -> str:
     if image.dtype != np.uint8 or image.shape[2] not in (3, 4) or not image.size:
         raise AvatarError(f"image: expected (H, W, 3 or 4) uint8 pixels, got {image.shape} {image.dtype}.")
     data = io.BytesIO()
-    require("PIL.Image").fromarray(np.ascontiguousarray(image)).save(data, **WEBP)
+    require("PIL.Image").fromarray(np.ascontiguousarray(image)).save(data, format="WEBP", quality=90, method=4)
     return f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
 
 
@@ -180,23 +178,16 @@ def _missing(text: str) -> str:
     return f'<p class="missing">{escape(text)}</p>'
 
 
-def _summary(content: ReportContent) -> str:
-    paragraphs = [f"<p>{escape(part.strip())}</p>" for part in content.summary.split("\n\n") if part.strip()]
-    if facts := "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in content.facts.items()):
-        paragraphs.append(f'<dl class="facts">{facts}</dl>')
-    return "\n".join(paragraphs)
-
-
 def _pictures(content: ReportContent) -> str:
-    cells = [f'<div class="head">{escape(column)}</div>' for column in content.columns]
+    cells = [f'<div class="head">{escape(column)}</div>' for column in COLUMNS]
     for row in content.pictures:
-        if len(row.pictures) != len(content.columns):
+        if len(row.pictures) != len(COLUMNS):
             raise AvatarError(
-                f"pictures: expected {len(content.columns)} for {row.title!r} ({', '.join(content.columns)}; None "
+                f"pictures: expected {len(COLUMNS)} for {row.title!r} ({', '.join(COLUMNS)}; None "
                 f"where there is none), got {len(row.pictures)}."
             )
         cells.append(f'<div class="pose">{escape(row.title)}</div>')
-        for picture, column in zip(row.pictures, content.columns):
+        for picture, column in zip(row.pictures, COLUMNS):
             cell = _missing(f"no {column}")
             if picture is not None:
                 source, (height, width) = picture_source(picture.image), picture.image.shape[:2]
@@ -204,7 +195,7 @@ def _pictures(content: ReportContent) -> str:
                 cell += f"<figcaption>{escape(picture.caption)}</figcaption>" if picture.caption else ""
             cells.append(f"<figure>{cell}</figure>")
     grid = "\n".join(cells)
-    return f'<div class="wide"><div class="pictures" style="--columns:{len(content.columns)}">\n{grid}\n</div></div>'
+    return f'<div class="wide"><div class="pictures" style="--columns:{len(COLUMNS)}">\n{grid}\n</div></div>'
 
 
 def _metrics(content: ReportContent) -> str:

@@ -17,11 +17,10 @@ Row = TypeVar("Row", "Score", "FrameScore")
 
 @dataclass(frozen=True)
 class Score:
-    """One number of a results table: a metric's mean over the frames of one outfit for one method.
-
-    ``variant`` tells settings of a method apart, ``seed``, ``steps``, ``seconds`` and ``fraction`` of the frames are of
-    its training, ``points`` is the mean count of predicted points, ``commit`` the code that made it. Files without
-    the last three columns are older.
+    """One number of a results table: a metric's mean over the frames of one outfit for one method. ``variant`` tells
+    settings of a method apart, ``seed``, ``steps``, ``seconds`` and ``fraction`` of the frames are of its training,
+    ``points`` is the mean count of predicted points, ``commit`` the code that made it. Files without the last three
+    columns are older.
     """
 
     table: str
@@ -82,9 +81,8 @@ def write_scores(path: str | Path, scores: Scores) -> None:
 
 
 def read_scores(*paths: str | Path) -> Scores:
-    """Reads what `write_scores` wrote to one or several files; those of single frames may be missing.
-
-    Raises `DataError` for a missing file, other columns, or a value of the wrong kind.
+    """Reads what `write_scores` wrote to one or several files; those of single frames may be missing. Raises
+    `DataError` for a missing file, other columns, or a value of the wrong kind.
     """
     scores = Scores()
     for path in map(Path, paths):

@@ -64,10 +64,9 @@ class Label:
 
 
 class Memory:
-    """Values of one method on an outfit that were measured before, each metric of each frame for itself.
-
-    ``ledger`` keeps them (None: nothing is kept); ``what`` is the method in words. ``source`` are the modules that make
-    the values (see `keyed`), ``made`` is what else they depend on; functions are asked for each frame by its name.
+    """Values of one method on an outfit that were measured before, each metric of each frame for itself. ``ledger``
+    keeps them (None: nothing is kept); ``what`` is the method in words. ``source`` are the modules that make the values
+    (see `keyed`), ``made`` is what else they depend on; functions are asked for each frame by its name.
     """
 
     def __init__(
@@ -116,11 +115,10 @@ def score_predictions(
     meshes: str | Path | None = None,
     ledger: Ledger | None = None,
 ) -> Scores:
-    """Scores a folder of predictions, ``<frame>.ply`` with normals for every frame of a split of an outfit.
-
-    ``meshes`` is a folder of predicted meshes, ``.ply`` or ``.obj``, which s2m_cm and normal_consistency then measure
-    instead of the points. Values that ``ledger`` keeps are not measured again. Raises `DataError` when frames have no
-    prediction (naming them) or one is in other units than its scan, and `AvatarError` naming a frame that is not valid.
+    """Scores a folder of predictions, ``<frame>.ply`` with normals for every frame of a split of an outfit. ``meshes``
+    is a folder of predicted meshes, ``.ply`` or ``.obj``, which s2m_cm and normal_consistency then measure instead of
+    the points. Values that ``ledger`` keeps are not measured again. Raises `DataError` when frames have no prediction
+    (naming them) or one is in other units than its scan, and `AvatarError` naming a frame that is not valid.
     """
     names = frame_names(outfit, split)
     clouds = find_predictions(Path(folder), names, (".ply",))
@@ -141,24 +139,17 @@ def score_predictions(
         return [file_digest(files[name]) for files in (clouds, surfaces) if files]
 
     memory = remember_points(ledger, "predictions", outfit, split, config, predicted=made_of)
-    contender = Contender(label, compare, memory)
-    return score_frames(outfit, split, names, point_metrics(outfit, config, surfaces), [contender], config.motion)
+    metrics = [metric for metric in find_metrics(config.metrics) if surfaces or not metric.needs_mesh]
+    return score_frames(outfit, split, names, metrics, [Contender(label, compare, memory)], config.motion)
 
 
 def measure_floors(
-    outfit: Outfit,
-    split: str,
-    config: ScoreConfig,
-    points: int,
-    commit: str = "",
-    ledger: Ledger | None = None,
-    floors: Sequence[str] = ("sampling", "body"),
+    outfit: Outfit, split: str, config: ScoreConfig, points: int, commit: str = "", ledger: Ledger | None = None
 ) -> Scores:
-    """Scores floors as if they were predictions of so many ``points``, each frame for itself.
-
-    ``sampling`` is a second sampling of the true surface: what a perfect surface scores. Outfits without ``resample``
-    have their scan points split into halves that are scored against each other, marked as variant ``halves``: with
-    fewer points that floor is too high. ``body`` are points spread area-uniformly over the posed bare body.
+    """Scores floors as if they were predictions of so many ``points``, each frame for itself. ``sampling`` is a second
+    sampling of the true surface: what a perfect surface scores. Outfits without ``resample`` have their scan points
+    split into halves instead, variant ``halves``: with fewer points that floor is too high. ``body`` are points spread
+    area-uniformly over the posed bare body.
     """
     resample, config = getattr(outfit, "resample", None), replace(config, motion=False)
 
@@ -166,7 +157,8 @@ def measure_floors(
         scan = draw_scan(frame, config)
         if resample is None:
             order = frame_generator(frame.name, config.seed + 1).permutation(len(scan.points))
-            again, scan = (pick_points(scan, np.sort(half)) for half in np.array_split(order, 2))
+            halves = map(np.sort, np.array_split(order, 2))
+            again, scan = (Scan(scan.points[half], scan.normals[half]) for half in halves)
         else:
             again = resample(split, frame.name, points, seed=config.seed + 1)
             if (again.points[:10, None] == frame.scan.points).all(axis=2).any(axis=1).all():
@@ -175,18 +167,16 @@ def measure_floors(
 
     def bare(frame: Frame) -> Comparison:
         body = posed_body(outfit, frame)
-        if body is None:
-            raise AvatarError("template: the body floor needs the body's faces, and this outfit has no template.")
         return Comparison(sample_body(body, points, config.seed), draw_scan(frame, config), body)
 
-    if resample is None and "sampling" in floors:
+    if resample is None:
         log.warning("%s: no true surface to sample again, so the sampling floor compares scan halves.", outfit.name)
-    kinds = {"sampling": (sampling, "halves" if resample is None else ""), "body": (bare, "")}
     contenders = []
-    for floor in floors:
-        (compare, variant), memory = kinds[floor], remember_points(ledger, floor, outfit, split, config, points=points)
+    for floor, compare, variant in (("sampling", sampling, "" if resample else "halves"), ("body", bare, "")):
+        memory = remember_points(ledger, floor, outfit, split, config, points=points)
         contenders.append(Contender(Label(floor, variant=variant, commit=commit, split=split), compare, memory))
-    return score_frames(outfit, split, frame_names(outfit, split), point_metrics(outfit, config), contenders)
+    metrics = [metric for metric in find_metrics(config.metrics) if not metric.needs_mesh]
+    return score_frames(outfit, split, frame_names(outfit, split), metrics, contenders)
 
 
 def remember_points(
@@ -197,19 +187,9 @@ def remember_points(
     return Memory(None if config.motion else ledger, what, outfit, split, **drawn, **made)
 
 
-def point_metrics(outfit: Outfit, config: ScoreConfig, surfaces: Any = ()) -> list[Metric]:
-    """The metrics asked for, as far as there are meshes to measure, and a body."""
-    metrics = [m for m in find_metrics(config.metrics) if surfaces or not m.needs_mesh]
-    if not getattr(outfit, "template", None) and any(m.needs_body for m in metrics):
-        metrics = [m for m in metrics if not m.needs_body]
-        log.warning("%s: no template, so penetration into the body is not scored.", outfit.name)
-    return metrics
-
-
-def posed_body(outfit: Outfit, frame: Frame) -> Mesh | None:
-    """The bare body under a frame as a mesh, or None where the outfit has no template to take faces from."""
-    template = getattr(outfit, "template", None)
-    return None if template is None else Mesh(frame.body.vertices, np.asarray(template.faces))
+def posed_body(outfit: Outfit, frame: Frame) -> Mesh:
+    """The bare body under a frame."""
+    return Mesh(frame.body.vertices, np.asarray(outfit.template.faces))
 
 
 def sample_body(body: Mesh, points: int, seed: int) -> PointCloud:
@@ -226,13 +206,8 @@ def draw_scan(frame: Frame, config: ScoreConfig) -> Scan:
     count = len(frame.scan.points)
     if count <= config.scan_points:
         return frame.scan
-    chosen = frame_generator(frame.name, config.seed).permutation(count)[: config.scan_points]
-    return pick_points(frame.scan, np.sort(chosen))
-
-
-def pick_points(scan: Scan, ids: np.ndarray) -> Scan:
-    """Some of a scan's points, with their normals alone."""
-    return Scan(scan.points[ids], scan.normals[ids])
+    chosen = np.sort(frame_generator(frame.name, config.seed).permutation(count)[: config.scan_points])
+    return Scan(frame.scan.points[chosen], frame.scan.normals[chosen])
 
 
 def frame_generator(name: str, seed: int) -> np.random.Generator:
@@ -241,16 +216,13 @@ def frame_generator(name: str, seed: int) -> np.random.Generator:
 
 
 def frame_names(outfit: Outfit, split: str) -> list[str]:
-    """The names of a split's frames in time; a split without any is an error."""
+    """The names of a split's frames, in time."""
 
     def in_time(name: str) -> tuple[str, int, str]:
         sequence, _, number = name.rpartition(".")
         return sequence, int(number) if number.isdecimal() else 0, name
 
-    names = sorted(outfit.frames(split), key=in_time)
-    if not names:
-        raise AvatarError(f"split: outfit {outfit.name} has no frames in {split!r}.")
-    return names
+    return sorted(outfit.frames(split), key=in_time)
 
 
 def find_predictions(folder: Path, names: Sequence[str], suffixes: tuple[str, ...] = (".ply",)) -> dict[str, Path]:
@@ -282,10 +254,9 @@ def score_frames(
     contenders: Sequence[Contender],
     motion: bool = False,
 ) -> Scores:
-    """Every metric of every frame of some contenders, frame by frame, and their means.
-
-    Values that a memory knows are not measured again; those that a frame does not have (NaN) are left out of the means.
-    Errors are passed on with the frame's name. ``motion`` measures metrics of sequences too.
+    """Every metric of every frame of some contenders, frame by frame, and their means. Values that a memory knows are
+    not measured again; those that a frame does not have (NaN) are left out of the means. Errors are passed on with the
+    frame's name. ``motion`` measures metrics of sequences too.
     """
     frames: list[FrameScore] = []
     found: dict[Label, dict[str, list[float]]] = {c.label: {m.name: [] for m in metrics} for c in contenders}

@@ -34,7 +34,6 @@ def closest_on_mesh(
     queries: np.ndarray, vertices: np.ndarray, faces: np.ndarray, exact_within: float = np.inf
 ) -> SurfaceHits:
     """The closest point of a mesh ``(V, 3)``, ``(F, 3)`` to each query ``(N, 3)``, exactly, and the query's side of it.
-
     The sign is that of the angle-weighted pseudo-normal (Baerentzen and Aanaes 2005), which is right for every closed
     mesh wound counter-clockwise from outside, also at edges and vertices. Beyond ``exact_within`` metres the first
     triangles tried will do (the distance is then too large, by less than the size of an average triangle); that saves
@@ -56,18 +55,15 @@ def closest_on_mesh(
 
 
 def _closest_faces(queries: np.ndarray, vertices: np.ndarray, faces: np.ndarray, exact_within: float) -> np.ndarray:
-    """The closest triangle of each query ``(N,)``: candidates by the distance of their pieces' centres.
-
-    Lists of candidates grow until no piece left out could be closer: its centre is too far away for its size. Long
-    triangles are cut into pieces about as small as the average one, for a single long one would make every search wide.
+    """The closest triangle of each query ``(N,)``: candidates by the distance of their pieces' centres. Lists of
+    candidates grow until no piece left out could be closer: its centre is too far away for its size. Long triangles are
+    cut into pieces about as small as the average one, for a single long one would make every search wide.
     """
     corners = vertices[faces]
     areas = trimesh.triangles.area(corners)
     longest = 1.6 * np.sqrt(areas.mean()) + np.ptp(corners) * 1e-3
-    places, pieces, owners = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=20, return_index=True)
-    centres = places[pieces].mean(axis=1)
-    reach = np.linalg.norm(places[pieces] - centres[:, None], axis=2).max()
-    tree = build_tree(centres)
+    _, owners, centres, reach = _cut(vertices, faces, longest)
+    tree, reach = build_tree(centres), reach.max()
     face_ids, remaining, k = np.empty(len(queries), np.int64), np.arange(len(queries)), FIRST_CANDIDATES
     while len(remaining):
         k, unsure = min(k, tree.n), []
@@ -84,9 +80,15 @@ def _closest_faces(queries: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
     return face_ids
 
 
+def _cut(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, ...]:
+    """Triangles cut into pieces of at most an edge length: corners ``(P, 3, 3)``, faces, centres, reach from them."""
+    places, pieces, owners = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=20, return_index=True)
+    centres = places[pieces].mean(axis=1)
+    return places[pieces], owners, centres, np.linalg.norm(places[pieces] - centres[:, None], axis=2).max(axis=1)
+
+
 def closest_on_triangles(queries: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The closest point of one triangle to each query. ``(N, 3)`` and ``(N, 3, 3)`` to points and weights, ``(N, 3)``.
-
     Weights are barycentric; those of a point on an edge or at a corner are exactly zero elsewhere.
     """
     squared, weights = _candidates(queries, corners)
@@ -95,9 +97,8 @@ def closest_on_triangles(queries: np.ndarray, corners: np.ndarray) -> tuple[np.n
 
 
 def _candidates(queries: np.ndarray, corners: np.ndarray) -> tuple[list, list]:
-    """Squared distances ``(N,)`` to the closest points inside triangles and on their edges, with barycentric weights.
-
-    A triangle is a + s u + t v, and the squared distance a quadratic in (s, t), from dot products alone. Inside comes
+    """Squared distances ``(N,)`` to the closest points inside triangles and on their edges, with barycentric weights. A
+    triangle is a + s u + t v, and the squared distance a quadratic in (s, t), from dot products alone. Inside comes
     first, infinitely far where the plane's minimum is not inside.
     """
     first, second, away = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], queries - corners[:, 0]
@@ -132,7 +133,6 @@ def _pseudo_normals(mesh: trimesh.Trimesh, face_ids: np.ndarray, weights: np.nda
 
 def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Whether each face ``(F, 3)`` of a mesh ``(V, 3)`` cuts through one that shares no vertex with it, ``(F,)`` bool.
-
     An edge that passes through a triangle is a crossing; triangles in one plane are not.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
@@ -142,14 +142,10 @@ def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     corners = vertices[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     longest = LONG * max(float(np.median(edges)), 1e-9)
-    pieces, cut, whole = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=20, return_index=True)
-    corners = pieces[cut]
-    centers = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
-    tree = build_tree(centers)
-    for start in range(0, len(cut), chunk := max(PAIRS // 64, 1)):
-        rows = np.arange(start, min(start + chunk, len(cut)))
-        found = tree.query_ball_point(centers[rows], reach[rows] + reach.max())
+    corners, whole, centres, reach = _cut(vertices, faces, longest)
+    tree = build_tree(centres)
+    for rows in np.array_split(np.arange(len(corners)), len(corners) * 64 // PAIRS + 1):
+        found = tree.query_ball_point(centres[rows], reach[rows] + reach.max())
         first = np.repeat(rows, [len(ids) for ids in found])
         second = np.concatenate(found).astype(np.int64)
         alike = (faces[whole[first]][:, :, None] == faces[whole[second]][:, None]).any(axis=(1, 2))
@@ -188,11 +184,10 @@ def view_axes() -> Tensor:
 
 
 def render_normals(points: Tensor, normals: Tensor, radius: float, center: Tensor, extent: float) -> Tensor:
-    """Orthographic normal maps of a cloud's discs, ``(6, PIXELS, PIXELS, 3)``, zero where nothing is seen.
-
-    ``points`` and unit ``normals (N, 3)`` float64; the discs' ``radius``, the views' ``center (3,)`` and their
-    ``extent`` from side to side in metres. A disc is drawn as a flat cone, so that of discs that overlap on one surface
-    the one whose middle is nearest shows.
+    """Orthographic normal maps of a cloud's discs, ``(6, PIXELS, PIXELS, 3)``, zero where nothing is seen. ``points``
+    and unit ``normals (N, 3)`` float64; the discs' ``radius``, the views' ``center (3,)`` and their ``extent`` from
+    side to side in metres. A disc is drawn as a flat cone, so that of discs that overlap on one surface the one whose
+    middle is nearest shows.
     """
     pixel = extent / PIXELS
     reach = int(np.ceil(radius / pixel))
@@ -224,18 +219,3 @@ def view_frame(scan: Tensor) -> tuple[Tensor, float]:
     """Centre and extent of views that show all of a scan ``(M, 3)``, whatever the direction."""
     low, high = scan.amin(dim=0), scan.amax(dim=0)
     return (low + high) / 2, float((high - low).norm()) + 2 * MARGIN
-
-
-def normal_map_error(maps: Tensor, scan_maps: Tensor) -> Tensor:
-    """Mean angle between two clouds' normal maps where both are seen, degrees; 180 where they nowhere overlap."""
-    both = maps.any(dim=-1) & scan_maps.any(dim=-1)
-    if not both.any():
-        return maps.new_tensor(180.0)
-    cosine = (maps[both] * scan_maps[both]).sum(dim=-1)
-    return torch.rad2deg(cosine.clamp(-1, 1).acos()).mean()
-
-
-def silhouette_overlap(maps: Tensor, scan_maps: Tensor) -> Tensor:
-    """Intersection over union of two clouds' silhouettes, all views together."""
-    mine, theirs = maps.any(dim=-1), scan_maps.any(dim=-1)
-    return (mine & theirs).sum().double() / (mine | theirs).sum().clamp(min=1)

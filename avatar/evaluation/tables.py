@@ -46,9 +46,8 @@ class Axis(Enum):
 
 @dataclass
 class FormConfig:
-    """Which axes run down a table and which across, the first of several being the slowest.
-
-    An outfit axis has its outfits, their mean and their worst, as chosen; else a cell is the mean over frames.
+    """Which axes run down a table and which across, the first of several being the slowest. An outfit axis has its
+    outfits, their mean and their worst, as chosen; else a cell is the mean over frames.
     """
 
     rows: tuple[Axis, ...] = (Axis.outfit,)
@@ -96,9 +95,8 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Table:
-    """A table ready to print: ``corner`` heads the labels, ``notes`` stand below.
-
-    ``groups``, if any, stand above the columns: one a column, equal neighbours as one heading.
+    """A table ready to print: ``corner`` heads the labels, ``notes`` stand below. ``groups``, if any, stand above the
+    columns: one a column, equal neighbours as one heading.
     """
 
     title: str
@@ -119,9 +117,6 @@ def outfit_table(rows: Sequence[Score], metric: str, view: View = View.VALUE) ->
     (known,) = find_metrics([metric])
     cells, ratio = aggregate.average_seeds(aggregate.rows_of(rows, [metric])), view in BASES
     methods, outfits = aggregate.order_methods({p.method for p in cells}), sorted({p.outfit for p in cells})
-    for floor in () if view is View.VALUE else ("sampling", BASES.get(view, "sampling")):
-        if floor not in map(base_method, methods):
-            raise AvatarError(f"rows: the view '{view.value}' needs the {floor} floor, and it was not scored.")
     falls = known.higher_is_better and not ratio
     ends = (f"mean over {'outfits' if ratio else 'frames'}", f"{'min' if falls else 'max'} over outfits")
     shown = view_cells(cells, view, METRICS)
@@ -145,13 +140,9 @@ def metric_table(rows: Sequence[Score], outfit: str) -> Table:
 def tabulate_metrics(
     rows: Sequence[Score], outfits: Sequence[str], known: Mapping[str, Metric], first: str = ""
 ) -> Table:
-    """Those of some metrics that were scored by methods, for some outfits, with their definitions in the notes.
-
-    Floors come first, or the method named ``first``.
+    """Those of some metrics that were scored by methods, for some outfits, with their definitions in the notes. Floors
+    come first, or the method named ``first``.
     """
-    if unknown := [outfit for outfit in outfits if outfit not in {row.outfit for row in rows}]:
-        there = ", ".join(sorted({row.outfit for row in rows}))
-        raise AvatarError(f"outfit: nobody scored {unknown[0]!r}; there are {there}.")
     cells = aggregate.average_seeds(row for row in rows if row.outfit in outfits and row.metric in known)
     methods = aggregate.order_methods({place.method for place in cells})
     methods.sort(key=lambda method: method != first if first else False)
@@ -166,10 +157,9 @@ def tabulate_metrics(
 def form_table(
     rows: Sequence[Score], metrics: Sequence[str], form: FormConfig, title: str = "", excess: bool = False
 ) -> Table:
-    """Scores in a paper's form; methods and outfits in their order of appearance, floors first.
-
-    Several seeds of a method are averaged, and named in the notes. With ``excess`` every value is less the sampling
-    floor's on the same outfit.
+    """Scores in a paper's form; methods and outfits in their order of appearance, floors first. Several seeds of a
+    method are averaged, and named in the notes. With ``excess`` every value is less the sampling floor's on the same
+    outfit.
     """
     known, axes = find_metrics(metrics), (*form.rows, *form.columns)
     cells = aggregate.average_seeds(aggregate.rows_of(rows, metrics), Axis.fraction in axes)
@@ -230,9 +220,8 @@ def _arrange(
     summaries: Sequence[str] = (),
     whole: bool = False,
 ) -> Table:
-    """A table of all combinations of the labels on its axes; lines without a number stay only in a ``whole`` one.
-
-    Axes that it lacks have their first label. Rows of outfits named in ``summaries`` are set off.
+    """A table of all combinations of the labels on its axes; lines without a number stay only in a ``whole`` one. Axes
+    that it lacks have their first label. Rows of outfits named in ``summaries`` are set off.
     """
 
     def heading(axis: Axis, label: str) -> str:
@@ -246,19 +235,15 @@ def _arrange(
         found = [cells.get(Place(*(place[axis] for axis in Axis))) for place in places]
         grid.append([None if cell is None else cell.value for cell in found])
     kept = [i for i in range(len(columns)) if whole or any(line[i] is not None for line in grid)]
-    body = tuple(
-        TableRow(
-            ", ".join(map(heading, down, row)),
-            tuple(line[i] for i in kept),
-            dict(zip(down, row)).get(Axis.outfit) in summaries,
-        )
-        for row, line in zip(rows, grid)
-        if whole or any(value is not None for value in line)
-    )
+    body = []
+    for row, line in zip(rows, grid):
+        if whole or any(value is not None for value in line):
+            summary = dict(zip(down, row)).get(Axis.outfit) in summaries
+            body.append(TableRow(", ".join(map(heading, down, row)), tuple(line[i] for i in kept), summary))
     names = [list(map(heading, across, columns[i])) for i in kept]
     groups = tuple(", ".join(parts[:-1]) for parts in names) if len(across) > 1 else ()
     corner = ", ".join(axis.value for axis in down)
-    return Table(title, corner, tuple(parts[-1] for parts in names), body, tuple(notes), groups)
+    return Table(title, corner, tuple(parts[-1] for parts in names), tuple(body), tuple(notes), groups)
 
 
 def reported_table(reported: ReportedTable) -> Table:
@@ -311,8 +296,8 @@ def budget_table(rows: Sequence[Score]) -> Table:
         note = f"Equal time: {np.mean(minutes):.1f} minutes each."
     else:
         note = "Neither steps nor time were equal."
-    shared = "Minutes are by the clock; jobs that share a machine slow each other down."
-    return Table("training of one run", "method", ("steps", "minutes"), tuple(body), (note, shared))
+    notes = (note, "Minutes are by the clock; jobs that share a machine slow each other down.")
+    return Table("training of one run", "method", ("steps", "minutes"), tuple(body), notes)
 
 
 def definitions(metrics: Iterable[Metric]) -> list[str]:

@@ -38,19 +38,23 @@ PICTURE = (480, 480)
 @prepared_process()
 def canonicalize(config: CanonicalizeConfig) -> Path:
     """Trains or resumes a run's canonicalizer, writes every frame's canonical scan, draws some; gives the folder.
-
     Refuses before any training: scores of data without truth, and pictures on a machine that cannot draw.
     """
     frames = config.frames()
     check_scored(config, frames)
     if config.pictures:
         load_pyvista()
+    make_canonical_scans(config, frames)
+    draw_canonical_scans(config, frames)
+    return config.folder
+
+
+def make_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> None:
+    """Trains or resumes a run's canonicalizer, writes every frame's canonical scan and scores some, if asked for."""
     train_canonicalizer(config, frames)
     canonicalize_frames(config, frames)
-    draw_canonical_scans(config, frames)
     if config.scored:
         score_canonical_scans(config, frames)
-    return config.folder
 
 
 def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
@@ -64,18 +68,16 @@ def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
 
 def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> Scores:
     """Writes ``<run>/scores.csv`` and ``scores.md``: this run, both baselines and the true weights on some frames.
-
     Variants are the splits: frames of training were learned from, those of test found their codes alone. What was
     measured before is measured again only where a scan, a canonicalizer or the code of either has changed.
     """
     outfit, scores, tables = frames.outfits[0], Scores(), []
-    kinds = dict.fromkeys((config.weights, WeightSource.knn, WeightSource.nearest))
     with lock_folder(config.folder, wait=True):
         ledger = Ledger(config.folder)
         for split in dict.fromkeys(where.split for where in frames.names):
             names = spaced_frames([where.name for where in frames.names if where.split == split], config.scored)
             methods, made_by = {}, {}
-            for kind in kinds:
+            for kind in dict.fromkeys((config.weights, WeightSource.knn, WeightSource.nearest)):
                 settings = replace(config, weights=kind)
                 source = skinning_source(settings, outfit.template)
                 learned = (source.steps, source.seconds) if isinstance(source, TrainedCanonicalizer) else (0, 0.0)

@@ -26,11 +26,10 @@ from avatar.methods.canonicalizer import CanonicalizeConfig
 from avatar.methods.points import check_count
 from avatar.methods.registry import find_method
 from avatar.methods.settings import MethodChoice, RunConfig
-from avatar.pipeline.canonicalization import canonicalize, check_scored, score_canonical_scans
+from avatar.pipeline.canonicalization import canonicalize, check_scored, make_canonical_scans
 from avatar.pipeline.reporting import CompareConfig, ReportConfig, compare, report
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict, scores_file
 from avatar.pipeline.surfaces import MeshConfig, mesh
-from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
 from avatar.runs.training import train
 from avatar.settings import settings_from_dict
 from avatar.world import current_world
@@ -58,10 +57,9 @@ class JobConfig(RunConfig):
 
 @dataclass
 class ExperimentConfig(JobConfig):
-    """One job of an experiment: a run with all that makes it a row of a table, and what the table looks like.
-
-    ``name`` is the beginning of the run's: budget, share of the training frames and seed follow, so that jobs that
-    differ in them never share a folder.
+    """One job of an experiment: a run with all that makes it a row of a table, and what the table looks like. ``name``
+    is the beginning of the run's: budget, share of the training frames and seed follow, so that jobs that differ in
+    them never share a folder.
     """
 
     surface: ExtractionConfig = field(default_factory=ExtractionConfig)  # of an implicit avatar
@@ -102,7 +100,6 @@ class DemoConfig(JobConfig):
 @prepared_process()
 def demo(config: DemoConfig) -> Path:
     """Runs the main job; gives ``<runs>/demo/summary.json``, which says what was made and how long each stage took.
-
     Refuses before any work: outfits without test frames, and a machine that cannot mesh or draw.
     """
     seconds: dict[str, float] = {}
@@ -154,9 +151,8 @@ def demo(config: DemoConfig) -> Path:
 
 @prepared_process()
 def experiment(config: ExperimentConfig) -> Path:
-    """Canonicalizes where the method needs it, trains, predicts and scores; gives the run's folder.
-
-    What is finished is not done again; what prediction, scores or pictures would refuse is refused before any work.
+    """Canonicalizes where the method needs it, trains, predicts and scores; gives the run's folder. What is finished is
+    not done again; what prediction, scores or pictures would refuse is refused before any work.
     """
     is_main, makers = current_world().is_main, canonicalizers_of(config)
     for split in set(config.compare.splits) - {VALIDATION}:
@@ -168,11 +164,7 @@ def experiment(config: ExperimentConfig) -> Path:
         load_pyvista()
     for settings in makers:
         with lock_folder(settings.folder, wait=True):  # another job may be making it
-            frames = settings.frames()
-            train_canonicalizer(settings, frames)
-            canonicalize_frames(settings, frames)
-            if settings.scored:
-                score_canonical_scans(settings, frames)
+            make_canonical_scans(settings, settings.frames())
     run = train(config.run)
     made = {"points": config.points, "surface": config.surface, "device": config.device}
     for split in config.compare.splits if is_main else ():  # what the folder's ledgers know is not done again

@@ -19,7 +19,7 @@ from avatar.values import option
 
 RESUMED = ("simulate", "canonicalize", "train", "predict", "evaluate", "mesh", "experiment")  # skip what is finished
 SPLITS = ("train", "test", "interpolation", "validation")
-STOP = "stop"  # a file that says so
+STOP = "stop"  # a file in the folder of a multirun that was asked to stop
 report = logging.getLogger(__name__)
 
 
@@ -99,9 +99,8 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """One job: ``number`` in the multirun, its command line, how far it got, and why no further.
-
-    ``settings`` are those of a finished job, as plain values.
+    """One job: ``number`` in the multirun, its command line, how far it got, and why no further. ``settings`` are those
+    of a finished job, as plain values.
     """
 
     number: int
@@ -138,11 +137,6 @@ def ask_to_stop(folder: Path, number: int) -> bool:
                 os.kill(outcome.process, number)
                 found = True
     return found
-
-
-def is_stopping(folder: Path) -> bool:
-    """Whether the multirun was asked to stop."""
-    return (folder / STOP).exists()
 
 
 def summarise(outcomes: list[Outcome]) -> str:

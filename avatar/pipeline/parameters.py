@@ -82,5 +82,5 @@ def parameter_table(counts: list[Count], size: str) -> Table:
         for label, line in lines.items():
             texts = tuple(f"{line[part]:,}" if part in line else "–" for part in parts)
             body += [TableRow(label, tuple(map(line.get, parts)), texts=texts)] if line else []
-    notes = ("One outfit on the open body. Skinning fields of canonicalizers are not counted.",)
-    return Table(f"parameters, size={size}", "method", tuple(parts), tuple(body), notes)
+    note = "One outfit on the open body. Skinning fields of canonicalizers are not counted."
+    return Table(f"parameters, size={size}", "method", tuple(parts), tuple(body), (note,))

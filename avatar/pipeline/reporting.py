@@ -90,9 +90,8 @@ class CompareConfig:
 
 @prepared_process()
 def report(config: ReportConfig) -> Path:
-    """Writes ``<run>/report.html`` and, as one picture, ``<run>/pictures.png``.
-
-    What has not been predicted, meshed or scored is said to be missing on the page.
+    """Writes ``<run>/report.html`` and, as one picture, ``<run>/pictures.png``. What has not been predicted, meshed or
+    scored is said to be missing on the page.
     """
     avatar = load_avatar(config.run)
     rows, settings = [], avatar.config
@@ -101,28 +100,39 @@ def report(config: ReportConfig) -> Path:
     for outfit in scored.run_outfits(avatar, config.data_root):
         names = spaced_frames(list(outfit.frames(config.split)), config.frames)
         rows += [pose_pictures(config, avatar, outfit, name) for name in names]
-        rows += template_pictures(avatar, outfit)
+        garment = avatar.method.garment(avatar, outfit.name, 50_000)  # at rest, of methods that have one
+        if garment is not None:
+            image = pictures.render_points(garment, pictures.frame_camera(garment.points))
+            template = Picture(image, f"garment template of {outfit.name}")
+            rows.append(PictureRow(f"{outfit.name}: at rest", (None, None, template, None, None)))
     pictures.save_picture(config.run / "pictures.png", picture_sheet(rows))
+    facts = {
+        "training": f"{avatar.steps} steps, {avatar.seconds / 60:.1f} min",
+        "parameters": f"{sum(p.numel() for p in avatar.model.parameters()):,}",
+    }
+    for row in aggregate.by_split(scores.rows):
+        if row.metric == "cd_point" and row.split == scores.rows[0].split:
+            facts[f"cd_point, {row.method}, {row.outfit}"] = f"{row.value * 1e4:.3f} x 1e-4 m²"
+    files = [path for path in config.run.iterdir() if path.is_file() and path.name[0] != "."]
+    folders = {path.parent for of in ("predictions", "meshes", "export") for path in (config.run / of).rglob("*.*")}
     seen = "of those trained on" if config.split == "train" else "none of which were trained on"
     content = ReportContent(
         title=f"{settings.method.variant} on {', '.join(settings.outfit)}",
         subtitle=f"data set {settings.dataset}, {config.split} poses, {seen}",
         summary="Points are predicted from the posed body alone; ground truth is a scan of the simulated clothes.",
-        facts=headline_facts(avatar, scores),
+        facts=facts,
         config_yaml=(config.run / "config.yaml").read_text(),
         metrics_csv=config.run / "metrics.csv",
         tables=tuple(scored.score_tables(scores.rows)),
         pictures=tuple(rows),
-        files=made_files(config.run),
+        files=(*sorted(path for path in files if path.name != "report.html"), *sorted(folders)),
     )
     return write_report(config.run, content)
 
 
 def gather_scores(runs: Sequence[Path], splits: Sequence[str], root: Path, complete: bool = True) -> Scores:
-    """The scores of runs, split by split, each behind the floors of its outfits below ``root``.
-
-    Files that are missing are left out unless all are to be ``complete``. Outfits of one name in several data sets are
-    an `AvatarError`.
+    """The scores of runs, split by split, each behind the floors of its outfits below ``root``. Files that are missing
+    are left out unless all are to be ``complete``. Outfits of one name in several data sets are an `AvatarError`.
     """
     found, datasets = Scores(), {}
     for split in splits:
@@ -146,31 +156,21 @@ def gather_scores(runs: Sequence[Path], splits: Sequence[str], root: Path, compl
     return found
 
 
-def headline_facts(avatar: TrainedAvatar, scores: Scores) -> dict[str, str]:
-    """The numbers on top of the page: of the test split, or of another where that was not scored."""
-    facts = {
-        "training": f"{avatar.steps} steps, {avatar.seconds / 60:.1f} min",
-        "parameters": f"{sum(p.numel() for p in avatar.model.parameters()):,}",
-    }
-    for row in aggregate.by_split(scores.rows):
-        if row.metric == "cd_point" and row.split == scores.rows[0].split:
-            facts[f"cd_point, {row.method}, {row.outfit}"] = f"{row.value * 1e4:.3f} x 1e-4 m²"
-    return facts
-
-
 def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, name: str) -> PictureRow:
     """Ground truth, prediction, garment template, mesh and error of one unseen pose, in one framing."""
     frame = outfit.load(config.split, name)
     scan = frame.scan
     camera = pictures.frame_camera(scan.points, "three_quarter")
-    truth = draw_cloud(PointCloud(scan.points, scan.normals, scan.colors), camera)
+    own = "normals" if scan.colors is None else scan.colors
+    truth = pictures.render_points(PointCloud(scan.points, scan.normals), camera, own)
     shown = {"ground truth": Picture(truth, f"scan of {name}")}
     path = scored.predictions_folder(config.run, config.split, outfit.name) / f"{name}.ply"
     if path.is_file():
         cloud = read_points(path)
         errors = build_tree(scan.points).query(cloud.points, workers=-1)[0]
         hot = pictures.render_error(cloud, errors, MAX_ERROR, camera)
-        shown["prediction"] = Picture(draw_cloud(cloud, camera), f"predicted points for {name}")
+        image = pictures.render_points(cloud, camera, "normals" if cloud.colors is None else cloud.colors)
+        shown["prediction"] = Picture(image, f"predicted points for {name}")
         shown["error"] = Picture(
             np.concatenate([hot, pictures.color_bar(MAX_ERROR, hot.shape[0])], axis=1),
             f"distance of predicted points of {name} to the scan",
@@ -185,11 +185,6 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
     return PictureRow(f"{outfit.name}: {name}", tuple(map(shown.get, COLUMNS)))
 
 
-def draw_cloud(cloud: PointCloud, camera: pictures.Camera) -> np.ndarray:
-    """A picture of points in their own colours, where they have some, or by their normals."""
-    return pictures.render_points(cloud, camera, "normals" if cloud.colors is None else cloud.colors)
-
-
 def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
     """The poses' pictures as one, without the error column; empty where one could not be made, no column of nothing."""
     shown = [row.pictures[:-1] for row in rows if row.pictures[0] is not None]
@@ -199,35 +194,19 @@ def picture_sheet(rows: list[PictureRow]) -> np.ndarray:
     return pictures.contact_sheet(images, column_labels=[COLUMNS[column] for column in kept])
 
 
-def template_pictures(avatar: TrainedAvatar, outfit: Outfit) -> list[PictureRow]:
-    """The explicit garment template in the canonical pose; no row for methods without one."""
-    cloud = avatar.method.garment(avatar, outfit.name, 50_000)
-    if cloud is None:
-        return []
-    image = pictures.render_points(cloud, pictures.frame_camera(cloud.points))
-    template = Picture(image, f"garment template of {outfit.name}")
-    return [PictureRow(f"{outfit.name}: at rest", (None, None, template, None, None))]
-
-
-def made_files(run: Path) -> tuple[Path, ...]:
-    """What the run made: its files and, for folders of many, the folder."""
-    files = [path for path in run.iterdir() if path.is_file() and path.name != "report.html" and path.name[0] != "."]
-    folders = {path.parent for kind in ("predictions", "meshes", "export") for path in (run / kind).rglob("*.*")}
-    return (*sorted(files), *sorted(folders))
-
-
 @prepared_process()
 def compare(config: CompareConfig) -> Path:
-    """Writes ``<out>/<table>.*``, which it prints; gives the path of the Markdown.
-
-    ``.csv`` and ``.frames.csv`` hold the tidy scores, ``.md`` and ``.tex`` the tables, ``.differences.csv`` those to
-    the baseline, ``.<plot>.png`` the plots, ``.poses.jpg`` the same unseen poses by all methods. Canonicalizers can be
-    compared alone; ``.canonical.csv`` holds their scores. Raises `AvatarError` when nothing was scored, or when
-    outfits of one name in two data sets would share a row.
+    """Writes ``<out>/<table>.*``, which it prints; gives the path of the Markdown. ``.csv`` and ``.frames.csv`` hold
+    the tidy scores, ``.md`` and ``.tex`` the tables, ``.differences.csv`` those to the baseline, ``.<plot>.png`` the
+    plots, ``.poses.jpg`` the same unseen poses by all methods. Canonicalizers can be compared alone; ``.canonical.csv``
+    holds their scores. Raises `AvatarError` when nothing was scored, or when outfits of one name in two data sets would
+    share a row.
     """
     found, made = [], []
     if config.runs or not config.canonicalizers:
-        found, made = compare_runs(config, config.runs or named_runs(config))
+        folders = [config.runs_root / method / dataset for dataset in config.dataset for method in config.methods]
+        scores = [path for folder in folders for path in sorted(folder.glob(f"*/{config.name}/scores.csv"))]
+        found, made = compare_runs(config, config.runs or tuple(path.parent for path in scores))
     found += canonical_tables(config)
     text = "\n".join([*map(tables.to_markdown, found), *(f"![{path.stem}]({path.name})" for path in made), ""])
     write_whole(file_of(config, "md"), text.encode())
@@ -259,20 +238,12 @@ def compare_runs(config: CompareConfig, runs: tuple[Path, ...]) -> tuple[list[Ta
     found += [] if config.reported is None else [tables.reported_table(config.reported)]
     made = [*save_plots(config, scores.only("split", splits[:1]).rows, runs)]
     grid = file_of(config, "poses.jpg")
-    if config.pictures and draw_pose_grid(config, grid, runs):
-        made.append(grid)
-    return found, made
+    return found, made + ([grid] if config.pictures and draw_pose_grid(config, grid, runs) else [])
 
 
 def file_of(config: CompareConfig, suffix: str) -> Path:
     """One of the table's files."""
     return (config.out or config.runs_root / "tables") / f"{config.table}.{suffix}"
-
-
-def named_runs(config: CompareConfig) -> tuple[Path, ...]:
-    """The scored runs of the data sets, methods and name asked for."""
-    folders = [config.runs_root / method / dataset for dataset in config.dataset for method in config.methods]
-    return tuple(path.parent for of in folders for path in sorted(of.glob(f"*/{config.name}/scores.csv")))
 
 
 def dataset_of(run: Path) -> str:
@@ -284,9 +255,8 @@ def dataset_of(run: Path) -> str:
 
 
 def main_tables(config: CompareConfig, rows: list[Score], splits: list[str]) -> list[Table]:
-    """The table in the form asked for, or outfits by methods for each metric with the excess over the floors.
-
-    A form has all splits as outfits of their own and then no summary over outfits; else each split has its tables.
+    """The table in the form asked for, or outfits by methods for each metric with the excess over the floors. A form
+    has all splits as outfits of their own and then no summary over outfits; else each split has its tables.
     """
     if config.form is None and len(splits) > 1:
         found = {split: main_tables(config, [row for row in rows if row.split == split], [split]) for split in splits}
@@ -357,25 +327,24 @@ def save_plots(config: CompareConfig, rows: list[Score], runs: tuple[Path, ...])
     logs: dict[str, dict[str, Path]] = {}
     for run in runs:
         if (run / "metrics.csv").is_file():
-            first = read_scores(run / "scores.csv").rows[0]
+            first = read_scores(scored.scores_file(run, config.splits[0])).rows[0]
             logs.setdefault(run.parent.name, {})[method_key(first)] = run / "metrics.csv"
     if logs:
         figures["progress"] = plots.plot_progress(logs)
     for name, figure in figures.items():
-        plots.save_figure(figure, file_of(config, f"{name}.png"))
+        figure.savefig(file_of(config, f"{name}.png"), dpi=150, facecolor="white")
         yield file_of(config, f"{name}.png")
 
 
 def draw_pose_grid(config: CompareConfig, path: Path, runs: Sequence[Path]) -> bool:
     """Writes the same unseen poses by all methods beside the ground truth, as in CloSET's figure 4; false for none.
-
     Rows are evenly spaced poses of every outfit, columns the methods, blank without a prediction, and the truth.
     """
     split, outfits = config.splits[0], {}
     folders: dict[str, dict[str, Path]] = {}  # of predictions, by outfit and method
     for run in runs:
         settings = yaml.safe_load((run / "config.yaml").read_text()) if (run / "config.yaml").is_file() else {}
-        for name, row in {row.outfit: row for row in read_scores(run / "scores.csv").rows}.items():
+        for name, row in {row.outfit: row for row in read_scores(scored.scores_file(run, split)).rows}.items():
             folder = scored.predictions_folder(run, split, name) if settings else run
             if not any(folder.glob("*.ply")):
                 continue

@@ -94,8 +94,7 @@ def scores_file(folder: Path, split: str) -> Path:
 @prepared_process()
 def predict(config: PredictConfig) -> list[Path]:
     """Predicts every outfit of a run; gives the folders of point clouds. A motion needs bodies that can be posed."""
-    avatar = load_avatar(config.run, config.checkpoint, config.device)
-    folders = []
+    avatar, folders = load_avatar(config.run, config.checkpoint, config.device), []
     for outfit in run_outfits(avatar, config.data_root):
         motion = config.motion and read_body_motion(config.motion, outfit.posable_body(), config.fps, config.up)
         name = motion.name if motion else config.split
@@ -119,10 +118,9 @@ def predicted_fps(folder: Path) -> float:
 
 @prepared_process()
 def evaluate(config: EvaluateConfig) -> Scores:
-    """Scores runs, or a foreign program's predictions, beside their floors; prints the tables.
-
-    Each run's scores go to its `scores_file`, the floors to that in `floors_folder`. Ledgers there keep what was
-    measured: what is unchanged (predictions, data, settings, and the code of the metrics) is not measured again.
+    """Scores runs, or a foreign program's predictions, beside their floors; prints the tables. Each run's scores go to
+    its `scores_file`, the floors to that in `floors_folder`. Ledgers there keep what was measured: what is unchanged
+    (predictions, data, settings, and the code of the metrics) is not measured again.
     """
     scores = score_runs(config) if config.predictions is None else score_foreign(config, config.predictions)
     print("\n".join(map(to_markdown, score_tables(scores.rows))))
@@ -202,10 +200,9 @@ def floors_root(run: Path, settings: RunConfig) -> Path:
 
 
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
-    """The sampling floor and the bare body for one outfit at a point count, kept in a file for the next method.
-
-    Metrics that the file has of the same points, seed, scanner, data and code stay in it. Another process that wants
-    the same floors waits for them.
+    """The sampling floor and the bare body for one outfit at a point count, kept in a file for the next method. Metrics
+    that the file has of the same points, seed, scanner, data and code stay in it. Another process that wants the same
+    floors waits for them.
     """
     memory = scoring.remember_points(None, "floors", outfit, config.split, config.score, points=points)
     key = digest_of([memory.made_of(name) for name in outfit.frames(config.split)])
@@ -261,10 +258,8 @@ def score_tables(rows: Sequence[Score]) -> list[Table]:
 
 def current_commit() -> str:
     """The short hash of the code's commit, or nothing outside a checkout."""
-    here = Path(__file__).parent
-    command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--exclude", "*"]
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"]
     try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return ""
-    return result.stdout.strip() if result.returncode == 0 else ""

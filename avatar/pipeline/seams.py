@@ -134,9 +134,8 @@ class SeamTest(NamedTuple):
 
 @prepared_process()
 def seams(config: SeamsConfig) -> Path:
-    """Writes ``<out>/<table>.csv`` and ``<table>.md``, which it prints; gives the path of the latter.
-
-    Refuses before anything is measured: no runs, implicit ones, a baseline that is none of them.
+    """Writes ``<out>/<table>.csv`` and ``<table>.md``, which it prints; gives the path of the latter. Refuses before
+    anything is measured: no runs, implicit ones, a baseline that is none of them.
     """
     asked, every, tables = runs_by_outfit(config), [], []
     for mine in asked if config.baseline else ():
@@ -201,9 +200,8 @@ def edge_sides(faces: Tensor, edges: Tensor) -> EdgeSides:
 
 
 def seam_distance(points: np.ndarray, vertices: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Distance ``(N,)`` of points ``(N, 3)`` on a body at rest to the nearest of its edges ``(E, 2)``, metres.
-
-    Straight through space and to half a millimetre; near a seam that is the way along the surface.
+    """Distance ``(N,)`` of points ``(N, 3)`` on a body at rest to the nearest of its edges ``(E, 2)``, metres. Straight
+    through space and to half a millimetre; near a seam that is the way along the surface.
     """
     if not len(edges):
         raise AvatarError("edges: expected an atlas with seams, got one without any.")
@@ -248,8 +246,6 @@ def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def measure_seams(cloud: PointCloud, scan: Scan, places: SeamPlaces) -> np.ndarray:
     """Sums of the `KEYS` over the predictions that end on cloth, and their counts, ``(K, 2)``, of one frame."""
     count, seams, others = len(places.distances), len(places.seams.left.face_ids), len(places.others.left.face_ids)
-    if len(cloud.points) != count + 2 * (seams + others):
-        raise AvatarError(f"cloud: expected a point for each place, got {len(cloud.points)}.")
     errors, bands, values = point_errors(cloud, scan), np.digitize(places.distances, LIMITS) - 1, []
     for band in range(len(LIMITS) - 1):
         mine = (bands == band) & errors.clothed[:count]

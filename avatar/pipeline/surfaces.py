@@ -50,9 +50,8 @@ class ExportConfig:
 
 @prepared_process()
 def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
-    """Meshes the predictions of every outfit of a run into ``<run>/meshes/<split>/<outfit>``.
-
-    Frames that could not be meshed are an `AvatarError` after all of them.
+    """Meshes the predictions of every outfit of a run into ``<run>/meshes/<split>/<outfit>``. Frames that could not be
+    meshed are an `AvatarError` after all of them.
     """
     avatar, reports = load_avatar(config.run), {}
     for name in avatar.config.outfit:
@@ -80,10 +79,9 @@ def spaced_frames(names: list[str], count: int | None) -> list[str]:
 
 @prepared_process()
 def export(config: ExportConfig) -> list[Path]:
-    """Writes ``<run>/export/<motion>/<outfit>/{points.usdc, meshes.usdc, body.glb, preview.webp}``.
-
-    Meshes are there when the sequence was meshed, joint tracks when its motion file is given. Frames are shown at the
-    times of their numbers. Several sequences (those of a split) have a folder each, ``<outfit>/<sequence>``.
+    """Writes ``<run>/export/<motion>/<outfit>/{points.usdc, meshes.usdc, body.glb, preview.webp}``. Meshes are there
+    when the sequence was meshed, joint tracks when its motion file is given. Frames are shown at the times of their
+    numbers. Several sequences (those of a split) have a folder each, ``<outfit>/<sequence>``.
     """
     avatar, written, jobs = load_avatar(config.run), [], []
     for outfit in run_outfits(avatar, config.data_root):
@@ -129,7 +127,8 @@ def export_sequence(folder: Path, meshes: Path, frames: dict[int, str], fps: flo
     write_animation(target / "preview.webp", images, fps, list(clouds))
     surfaces = {number: meshes / f"{name}.ply" for number, name in frames.items()}
     surfaces = {number: path for number, path in surfaces.items() if path.is_file()}
+    made = ["points.usdc", "preview.webp"]
     if surfaces:
         write_usd_meshes(target / "meshes.usdc", map(read_mesh, surfaces.values()), fps, list(surfaces))
-    written = [target / name for name in ("points.usdc", "preview.webp")]
-    return written + ([target / "meshes.usdc"] if surfaces else [])
+        made.append("meshes.usdc")
+    return [target / name for name in made]

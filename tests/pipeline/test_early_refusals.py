@@ -56,7 +56,7 @@ def idle(monkeypatch):
 
     for module, names in {
         canonicalization: ("train_canonicalizer",),
-        experiments: ("train", "train_canonicalizer", "canonicalize"),
+        experiments: ("train", "make_canonical_scans", "canonicalize"),
     }.items():
         for name in names:
             monkeypatch.setattr(module, name, refuse)
