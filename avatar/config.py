@@ -36,8 +36,8 @@ from avatar.environment import prepared_process
 from avatar.help import help_text
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
 from avatar.io.documents import read_yaml
-from avatar.pipeline.endings import report_ending
-from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, note_outcome, read_outcomes, summarise
+from avatar.pipeline import outcomes
+from avatar.pipeline.outcomes import State
 from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.signals import Stopped, leave_when_asked, listening
@@ -122,7 +122,7 @@ def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | Non
         run_job(name, verb, run, config, journal, parent)
 
     code = 0
-    with torchrun_world() as world, leave_when_asked(lambda number: ask_to_stop(journal, number)):
+    with torchrun_world() as world, leave_when_asked(lambda number: outcomes.ask_to_stop(journal, number)):
         listen_to_verbs(logging.INFO if world.is_main else logging.WARNING)
         try:
             register(name, verb)
@@ -139,24 +139,24 @@ def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | Non
             code = refuse(name, explain(error, name, sys.argv[1:], CONF))
         except AvatarError as error:
             code = refuse(name, error)
-        outcomes = read_outcomes(journal)
-        if outcomes and code != PIPE_CLOSED:
-            code = conclude(name, verb, outcomes) or code
+        jobs = outcomes.read_outcomes(journal)
+        if jobs and code != PIPE_CLOSED:
+            code = conclude(name, verb, jobs) or code
     sys.exit(code)
 
 
-def conclude(name: str, verb: Verb, outcomes: list[Outcome]) -> int:
+def conclude(name: str, verb: Verb, jobs: list[outcomes.Outcome]) -> int:
     """Says what became of a multirun's jobs and calls the verb's ``then`` for those that finished; the exit code."""
-    print(summarise(outcomes), file=sys.stderr)
-    states = {State(outcome.state) for outcome in outcomes} - {State.finished}
+    print(outcomes.summarise(jobs), file=sys.stderr)
+    states = {State(job.state) for job in jobs} - {State.finished}
     if State.stopped in states:
         return STOPPED
     code = 2 if states else 0
-    finished = [outcome.settings for outcome in outcomes if outcome.state == State.finished.value]
+    finished = [job.settings for job in jobs if job.state == State.finished]
     if verb.then and finished:
-        jobs = [settings_from_dict(resolve(verb.settings), settings) for settings in finished]
+        done = [settings_from_dict(resolve(verb.settings), settings) for settings in finished]
         try:
-            report.info("%s: %s", name, resolve(verb.then)(jobs))
+            report.info("%s: %s", name, resolve(verb.then)(done))
         except AvatarError as error:
             code = refuse(name, error)
     return code
@@ -178,16 +178,16 @@ def run_job(
     def end(state: State, why: str, code: int) -> None:
         print(f"{line}: {why}", file=sys.stderr)
         if several:
-            note_outcome(journal, job.job.num, line, state, why)
+            outcomes.note_outcome(journal, job.job.num, line, state, why)
         if not several or (state is State.stopped and os.getpid() == parent):
             sys.exit(code)
 
-    if several and is_stopping(journal):
+    if several and (journal / outcomes.STOP).exists():
         return end(State.stopped, "not begun.", STOPPED)
     if several and current_world().size > 1:
         return end(State.failed, "torchrun trains one run; leave out either it or --multirun.", 2)
     if several:
-        note_outcome(journal, job.job.num, line, State.running)
+        outcomes.note_outcome(journal, job.job.num, line, State.running)
     try:
         if isinstance(trained := getattr(to_settings(declared(verb.settings), config), "run", None), Path):
             check_trained(trained / "avatar")  # a run that is not there is refused before its verb is imported
@@ -198,7 +198,7 @@ def run_job(
             WORK.clear()
             started = time.monotonic()
             result = run(settings)
-            report_ending(name, settings, result, time.monotonic() - started)
+            outcomes.report_ending(name, settings, result, time.monotonic() - started)
             if verb.then and not several and current_world().is_main:
                 report.info("%s: %s", name, resolve(verb.then)([settings]))
     except Stopped as stopped:
@@ -219,7 +219,7 @@ def run_job(
         traceback.print_exc()
         return end(State.failed, f"{type(error).__name__}: {error}", 1)
     if several:
-        note_outcome(journal, job.job.num, line, State.finished, settings=settings_to_dict(settings))
+        outcomes.note_outcome(journal, job.job.num, line, State.finished, settings=settings_to_dict(settings))
     return None
 
 

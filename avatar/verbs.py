@@ -77,8 +77,8 @@ VERBS = {
     ),
     "compare": Verb(
         "makes one table of many runs' scores",
-        "avatar.pipeline.comparison:compare",
-        "avatar.pipeline.comparison:CompareConfig",
+        "avatar.pipeline.reporting:compare",
+        "avatar.pipeline.reporting:CompareConfig",
         options="table runs runs_root dataset name methods metrics baseline pictures splits data_root out",
     ),
     "seams": Verb(
@@ -107,8 +107,8 @@ VERBS = {
     ),
     "demo": Verb(
         "does the main job on the embedded sample",
-        "avatar.pipeline.demo:demo",
-        "avatar.pipeline.demo:DemoConfig",
+        "avatar.pipeline.experiments:demo",
+        "avatar.pipeline.experiments:DemoConfig",
         options="dataset outfit size train.minutes static_share points meshes data_root runs_root device",
     ),
     "parameters": Verb(

@@ -22,8 +22,8 @@ from avatar.io.motions import write_motion
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, CycleConfig
 from avatar.methods.settings import MethodChoice
-from avatar.pipeline.comparison import CompareConfig, compare
-from avatar.pipeline.demo import DemoConfig, demo
+from avatar.pipeline.experiments import DemoConfig, demo
+from avatar.pipeline.reporting import CompareConfig, compare
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
 from avatar.simulate.sequences import authored_motion

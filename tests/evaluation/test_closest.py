@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
-from avatar.evaluation.closest import closest_on_mesh, closest_on_triangles
+from avatar.evaluation.shapes import closest_on_mesh, closest_on_triangles
 
 
 def posed_mesh():

@@ -53,8 +53,6 @@ def test_missing_frames_are_named(ball, predictions):
         score_predictions(predictions, ball, "test", ScoreConfig(metrics=FAST), Label("closet"))
     with pytest.raises(DataError, match="no such folder"):
         score_predictions(predictions / "none", ball, "test", ScoreConfig(metrics=FAST), Label("closet"))
-    with pytest.raises(AvatarError, match="no frames in 'tset'"):
-        score_predictions(predictions, ball, "tset", ScoreConfig(metrics=FAST), Label("closet"))
 
 
 def test_extra_files_are_ignored_with_a_warning(ball, predictions, caplog):
@@ -106,14 +104,6 @@ def test_meshes_take_the_place_of_points_in_surface_metrics(ball, predictions, t
     plain = score_predictions(predictions, ball, "test", config, Label("closet"))
     assert value(scores, "cd_point") == value(plain, "cd_point")
     assert "self_intersection" not in {row.metric for row in plain.rows}  # points have no faces
-
-
-def test_penetration_needs_a_template_and_is_left_out_with_a_warning(ball_without_truth, predictions, caplog):
-    config = ScoreConfig(metrics=["cd_point", "penetration_share"])
-    with caplog.at_level(logging.WARNING):
-        scores = score_predictions(predictions, ball_without_truth, "test", config, Label("closet"))
-    assert [row.metric for row in scores.rows] == ["cd_point"]
-    assert "penetration" in caplog.text
 
 
 def test_penetration_through_the_folder(ball, predictions, sphere_cloud):

@@ -13,7 +13,7 @@ CLOUDS = """
 import sys
 import numpy as np
 from avatar.environment import prepared_process
-from avatar.evaluation.closest import closest_on_mesh
+from avatar.evaluation.shapes import closest_on_mesh
 from avatar.geometry.trees import build_tree
 
 prepared = prepared_process()

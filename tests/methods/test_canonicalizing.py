@@ -18,7 +18,7 @@ from avatar.canonical.scans import DrawConfig, prepare_scan, to_root_frame
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset
 from avatar.data.scanner import ScanConfig
-from avatar.evaluation.canonical_scores import CANONICAL_METRICS
+from avatar.evaluation.canonical import CANONICAL_METRICS
 from avatar.evaluation.scores import read_scores
 from avatar.geometry import neighbours
 from avatar.geometry.transforms import transform_points
@@ -388,7 +388,7 @@ def test_canonical_scores_are_measured_again_when_their_code_or_the_scans_change
         return len(measured)
 
     assert [count(1), count(1)] == [6, 0]  # two splits of a frame, two baselines and the true weights
-    change_source("avatar.evaluation.canonical_scores")
+    change_source("avatar.evaluation.canonical")
     assert [count(2), count(2)] == [6, 0]
     assert found[0] == found[1] != found[2] == {method: 2 * value for method, value in found[0].items()}
     written = read_scores(config.folder / "scores.csv").rows

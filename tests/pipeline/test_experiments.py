@@ -16,14 +16,14 @@ from avatar.checks import AvatarError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
 from avatar.evaluation import scoring
-from avatar.evaluation.forms import Axis, FormConfig, ReportedTable
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
+from avatar.evaluation.tables import Axis, FormConfig, ReportedTable
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
 from avatar.methods.settings import MethodChoice
-from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.experiments import ExperimentConfig, experiment, tabulate_experiment
+from avatar.pipeline.reporting import CompareConfig, compare
 
 ROOT = Path(__file__).parents[2]
 METRICS = ("cd_point", "normal_l1")
@@ -79,15 +79,15 @@ def test_a_job_leaves_predictions_and_scores_with_what_tells_it_apart(jobs):
 
 
 def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatch, change_source):
-    run, drawn, real = jobs[1].run.folder, [], scoring.draw_scan
-    monkeypatch.setattr(scoring, "draw_scan", lambda frame, config: drawn.append(frame.name) or real(frame, config))
+    run, read, real = jobs[1].run.folder, [], scoring.read_points
+    monkeypatch.setattr(scoring, "read_points", lambda path: read.append(path.name) or real(path))
     (run / "scored.txt").write_text("of an older version: not believed")
 
     def again(job: ExperimentConfig) -> int:
         """How many predictions the job scores."""
-        drawn.clear()
+        read.clear()
         experiment(job)
-        return len(drawn)
+        return len(read)
 
     cloud = run / "predictions" / "test" / "tiny" / "check.00000.ply"
     before = {path: path.read_bytes() for path in (cloud, run / "avatar.safetensors", run / "scores.csv")}
@@ -97,7 +97,7 @@ def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatc
     other = replace(jobs[1], score=replace(jobs[1].score, seed=5))
     assert again(other) == 3 and (run / "scores.csv").read_bytes() != before[run / "scores.csv"]
     assert again(jobs[1]) == 0
-    change_source("avatar.evaluation.closest")
+    change_source("avatar.evaluation.shapes")
     assert again(jobs[1]) == 3 and again(jobs[1]) == 0
     assert before == {path: path.read_bytes() for path in before}
 
