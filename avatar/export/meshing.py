@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.checks import AvatarError, DataError, check_oriented
-from avatar.export.poisson import FAILED, READY, SOLVED, serve
+from avatar.export.poisson import serve
 from avatar.export.trimming import trim_surface
 from avatar.invocation import install_line
 from avatar.io.ledger import Ledger, file_digest, keyed
@@ -50,16 +50,10 @@ class PoissonConfig:
     memory_gb: float = 8.0  # address space of the worker, GiB; 0 for no limit
 
     def __post_init__(self):
-        for name, low, high in (
-            ("depth", 4, 12),
-            ("max_hole", 1e-3, 10),
-            ("min_part", 0, 1),
-            ("timeout_s", 0.001, 86400),
-            ("max_points", MIN_POINTS, 20_000_000),
-            ("memory_gb", 0, 1024),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
+        ranges = {"depth": (4, 12), "max_hole": (1e-3, 10), "min_part": (0, 1), "timeout_s": (0.001, 86400)}
+        ranges |= {"max_points": (MIN_POINTS, 20_000_000), "memory_gb": (0, 1024)}
+        for name, (low, high) in ranges.items():
+            if not low <= (value := getattr(self, name)) <= high:
                 raise AvatarError(f"{name}: expected a number from {low} to {high}, got {value}.")
 
 
@@ -73,8 +67,7 @@ class PoissonMesher:
 
     def __init__(self, config: PoissonConfig | None = None):
         self.config = config or PoissonConfig()
-        self._process = None
-        self._connection = None
+        self._process = self._connection = None
 
     def __enter__(self) -> PoissonMesher:
         return self
@@ -88,17 +81,10 @@ class PoissonMesher:
         return self._process.pid if self._process is not None else None
 
     def mesh(self, cloud: PointCloud) -> Mesh:
-        """The surface the points lie on, open where they leave it open.
+        """The surface, float32 and int64, of a cloud whose normals point outwards; open where the points leave it open.
 
-        Args:
-            cloud: ``points (N, 3)`` metres, ``normals (N, 3)`` pointing outwards, of any length but zero.
-
-        Returns:
-            A mesh with float32 vertices and int64 faces.
-
-        Raises:
-            MeshingError: for points that cannot be meshed, a timeout, or a worker that died; the reason is named.
-            AvatarError: when open3d cannot be imported.
+        Raises `MeshingError` for points that cannot be meshed, a timeout, or a worker that died, with the reason;
+        `AvatarError` when open3d cannot be imported.
         """
         points, normals = check_cloud(cloud, self.config.max_points)
         raw = self._solve(points, normals)
@@ -116,9 +102,8 @@ class PoissonMesher:
 
     def close(self) -> None:
         """Ends the worker. The next `mesh` starts another."""
-        if self._connection is not None:
-            self._connection.close()
         if self._process is not None:
+            self._connection.close()
             self._process.kill()
             self._process.join()
         self._process = self._connection = None
@@ -127,47 +112,41 @@ class PoissonMesher:
         """One job for the worker; whatever goes wrong, the next job finds a fresh one."""
         if self._process is None or not self._process.is_alive():
             self._start()
-        config, valid = self.config, False
+        config, answer = self.config, None
         watchdog = threading.Timer(config.timeout_s + GRACE_S, self._process.kill)  # a worker that does not even listen
         watchdog.start()
         try:
-            for array in (points, normals, np.array([config.depth], np.int32)):
-                self._connection.send_bytes(array)
+            self._connection.send((points, normals, config.depth))
             if not self._connection.poll(config.timeout_s):
                 raise MeshingError(f"no surface within timeout_s={config.timeout_s} s; depth={config.depth}.")
-            verdict = self._connection.recv_bytes()
-            if verdict == FAILED:
-                raise MeshingError(f"open3d: {self._connection.recv_bytes().decode()}")
-            vertices = np.frombuffer(self._connection.recv_bytes(), np.float64).reshape(-1, 3)
-            faces = np.frombuffer(self._connection.recv_bytes(), np.int32).reshape(-1, 3)
-            valid = verdict == SOLVED
+            answer = self._connection.recv()
+            if isinstance(answer, str):
+                raise MeshingError(f"open3d: {answer}")
         except (EOFError, OSError) as error:
             self._process.join(timeout=5)
-            code = self._process.exitcode
             raise MeshingError(
-                f"the meshing process died (exit code {code}) on {len(points)} points. Try a lower depth than "
-                f"{config.depth}, or more than memory_gb={config.memory_gb}."
+                f"the meshing process died (exit code {self._process.exitcode}) on {len(points)} points. Try a lower "
+                f"depth than {config.depth}, or more than memory_gb={config.memory_gb}."
             ) from error
         finally:
             watchdog.cancel()
-            if not valid:
+            if not isinstance(answer, tuple):
                 self.close()
-        return Mesh(vertices, faces)
+        return Mesh(*answer)
 
     def _start(self) -> None:
         self.close()
         context = multiprocessing.get_context("spawn")  # a forked copy of a threaded process may hang
         self._connection, far_end = context.Pipe()
-        memory = int(self.config.memory_gb * 2**30)
-        self._process = context.Process(target=serve, args=(far_end, memory), name="poisson", daemon=True)
+        arguments = (far_end, int(self.config.memory_gb * 2**30))
+        self._process = context.Process(target=serve, args=arguments, name="poisson", daemon=True)
         with interrupts_blocked():
             self._process.start()
         far_end.close()
         try:
             if not self._connection.poll(START_TIMEOUT_S):
                 raise MeshingError(f"the meshing process did not start within {START_TIMEOUT_S} s.")
-            verdict = self._connection.recv_bytes()
-            reason = self._connection.recv_bytes().decode() if verdict != READY else ""
+            reason = self._connection.recv()
         except (EOFError, OSError) as error:
             self.close()
             raise AvatarError(
@@ -180,11 +159,7 @@ class PoissonMesher:
 
 
 def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points and unit normals as float64, after refusing all that is known to crash or hang open3d.
-
-    Raises:
-        MeshingError: naming the reason.
-    """
+    """Points and unit normals as float64; raises `MeshingError` for all that is known to crash or hang open3d."""
     try:
         dims = check_oriented(cloud.points, cloud.normals)
     except AvatarError as error:
@@ -209,11 +184,7 @@ def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndar
 
 
 def require_poisson() -> None:
-    """Refuses a machine without open3d, in no time: it is not imported.
-
-    Raises:
-        AvatarError: with the line that installs it.
-    """
+    """Raises `AvatarError`, with the line to run, where open3d is not installed; it is not imported for that."""
     if find_spec("open3d") is None:
         raise AvatarError(f"meshing needs open3d. Run: {install_line('open3d')}")
 
@@ -239,17 +210,8 @@ def mesh_folder(
 
     Meshes made of the same cloud with the same settings are kept where their hashes are right, so that an interrupted
     run goes on where it stopped. A frame that fails does not stop the others; it is in the report with its reason.
-
-    Args:
-        predictions_dir: folder of oriented point clouds.
-        meshes_dir: folder to write to; made if need be.
-        formats: file name endings to write: ply, obj, glb, stl, off.
-        frames: names to mesh; all in the folder if None.
-        config: settings of the reconstruction.
-
-    Raises:
-        DataError: when there is nothing to mesh or a named frame is missing.
-        AvatarError: for another format, or when open3d is missing.
+    ``formats`` are among ply, obj, glb, stl, off; ``frames`` names to mesh, or None for all. Raises `DataError` when
+    there is nothing to mesh or a named frame is missing; `AvatarError` for another format, or without open3d.
     """
     started = time.monotonic()
     unknown = [ending for ending in formats if f".{ending}" not in FORMATS]
@@ -264,11 +226,10 @@ def mesh_folder(
         raise DataError(predictions_dir, f"{what} in this folder.", "Run tools/predict.py first.")
     done, skipped, failed, ledger = [], [], {}, Ledger(meshes_dir)
     settings = config or PoissonConfig()
-    with PoissonMesher(config) as mesher:
+    made = [settings.depth, settings.max_hole, settings.min_part]
+    with PoissonMesher(settings) as mesher:
         for name in tracked(names, "mesh"):
             source = predictions_dir / f"{name}.ply"
-            targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
-            made = [getattr(settings, option) for option in ("depth", "max_hole", "min_part")]
             key = keyed(SOURCE, cloud=file_digest(source), formats=formats, poisson=made)
             if ledger.find(name, key):
                 skipped.append(name)
@@ -278,6 +239,7 @@ def mesh_folder(
             except (MeshingError, DataError) as error:
                 failed[name] = str(error)
                 continue
+            targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
             for target in targets:
                 write_mesh(target, mesh)
             ledger.record(name, key, targets)

@@ -1,10 +1,9 @@
-"""What a Poisson surface must lose to be a garment again: the caps it invents across sleeves, necks and hems.
+"""Trimming of Poisson surfaces: the caps across sleeves, necks and hems, which no points support, are cut away.
 
-Poisson reconstruction closes every opening. Dropping a fixed share of low-density vertices (POP's way) leaves
-ragged rims and also eats closed surfaces, so support is measured here against the points themselves. A vertex is
-unsupported where its nearest points all lie to one side (their centroid is shifted along the surface as on a rim,
-whatever their density) and nothing follows on the other, or where the nearest point is far. The surface is cut
-along the line between, through its triangles.
+Dropping a fixed share of low-density vertices (POP's way) leaves ragged boundaries and also removes parts of closed
+surfaces, so support is measured against the points. A vertex is unsupported where its nearest points all lie to one
+side (their centroid is shifted along the surface as on a boundary, whatever their density) and nothing follows on the
+other, or where the nearest point is far. The surface is cut along the line between, through its triangles.
 """
 
 from __future__ import annotations
@@ -17,42 +16,34 @@ from avatar.geometry.trees import build_tree
 from avatar.records import Mesh, PointCloud
 
 NEIGHBOURS = 24
-RIM_SHIFT = 4 / (3 * np.pi)  # centroid of a half disc, in radii: what a vertex on a straight rim sees
-LOOK_AHEAD = 0.9  # share of the look-ahead ball that must be empty; its skin touches the vertex's own rim
+BOUNDARY_SHIFT = 4 / (3 * np.pi)  # centroid of a half disc, in radii: what a vertex on a straight boundary sees
+LOOK_AHEAD = 0.9  # share of the look-ahead ball that must be empty; its surface touches the vertex's own boundary
 SPACING_NEIGHBOUR = 8  # the point itself counted; its distance measures the local spacing
 HOLE_SPACINGS = 2.5  # random points leave gaps this many such distances wide
 BARELY = 1e-3  # how far below the cut forgiven vertices are put
 
 
 def trim_surface(mesh: Mesh, cloud: PointCloud, max_hole: float, min_part: float) -> Mesh:
-    """Cuts away what the points do not support.
+    """The part of a reconstructed surface that the points, with unit normals, support; without unused vertices.
 
-    Args:
-        mesh: the surface reconstructed from the points.
-        cloud: those points with unit normals.
-        max_hole: metres; gaps in the points up to this wide stay closed, wider ones are opened. Where points
-            are so sparse that such gaps are everywhere, a gap must be a few times their spacing.
-        min_part: connected parts with less than this share of the whole area are dropped.
-
-    Returns:
-        A mesh without unused vertices; without any triangle when nothing is supported.
+    Gaps in the points up to ``max_hole`` metres wide stay closed, wider ones are opened; where points are so sparse
+    that such gaps are everywhere, a gap must be a few times their spacing. Connected parts with less than the share
+    ``min_part`` of the whole area are dropped. The mesh has no triangles when nothing is supported.
     """
     tree = build_tree(cloud.points)
     near, _ = tree.query(cloud.points, k=min(SPACING_NEIGHBOUR, len(cloud.points)))
     holes = np.maximum(max_hole, HOLE_SPACINGS * near[:, -1])
     distances, ids = tree.query(mesh.vertices, k=min(NEIGHBOURS, len(cloud.points)))
     holes = holes[ids[:, 0]]
-
-    across = cloud.normals[ids[:, 0]]  # on a thin finger the centroid lies inside, which makes no rim
+    across = cloud.normals[ids[:, 0]]  # on a thin finger the centroid lies inside, which makes no boundary
     shifts = cloud.points[ids].mean(axis=1) - mesh.vertices
     shifts -= (shifts * across).sum(axis=1, keepdims=True) * across
     lengths = np.maximum(np.linalg.norm(shifts, axis=1), 1e-12)
-    excess = lengths / np.maximum(distances[:, -1], 1e-12) / RIM_SHIFT - 1
-
+    excess = lengths / np.maximum(distances[:, -1], 1e-12) / BOUNDARY_SHIFT - 1
     edge = np.flatnonzero(excess > 0)
     reach = holes[edge] / 2
     beyond, _ = tree.query(mesh.vertices[edge] - shifts[edge] / lengths[edge, None] * reach[:, None])
-    excess[edge[beyond < LOOK_AHEAD * reach]] = -BARELY  # something follows: a gap, not a rim
+    excess[edge[beyond < LOOK_AHEAD * reach]] = -BARELY  # something follows: a gap, not a boundary
     excess = np.maximum(excess, distances[:, 0] / (holes / 2) - 1)
     excess = _forgive_small_holes(mesh, excess, holes)
     return drop_small_parts(cut_surface(mesh, excess), min_part)
@@ -72,13 +63,9 @@ def _forgive_small_holes(mesh: Mesh, excess: np.ndarray, holes: np.ndarray) -> n
 
 
 def cut_surface(mesh: Mesh, values: np.ndarray) -> Mesh:
-    """The part of a mesh where values at its vertices, linear in between, are at most zero.
+    """The part of a mesh where values ``(V,)`` at its vertices, linear in between, are at most zero; without colours.
 
-    Triangles that the zero line crosses are split along it, so the rim is a line and not a row of teeth.
-
-    Args:
-        mesh: the mesh; its colours are not kept.
-        values: ``(V,)``.
+    Triangles that the zero line crosses are split along it, so the boundary is a line and not a row of teeth.
     """
     inside = values <= 0
     corners = inside[mesh.faces]
@@ -91,10 +78,10 @@ def cut_surface(mesh: Mesh, values: np.ndarray) -> Mesh:
     edges, ids = np.unique(pairs, axis=0, return_inverse=True)
     ids = ids.reshape(-1) + len(mesh.vertices)
     to_left, to_right = ids[: len(tip)], ids[len(tip) :]
-    start, end = (mesh.vertices[edges[:, i]].astype(np.float64) for i in (0, 1))
-    first, second = (values[edges[:, i]] for i in (0, 1))
+    start, end = mesh.vertices[edges].astype(np.float64).swapaxes(0, 1)
+    first, second = values[edges].T
     along = (first / np.where(first == second, 1, first - second))[:, None]
-    rim = start + along * (end - start)
+    boundary = start + along * (end - start)
     single = inside[tip]
     pieces = [
         kept,
@@ -102,7 +89,7 @@ def cut_surface(mesh: Mesh, values: np.ndarray) -> Mesh:
         np.stack([left, right, to_left], axis=1)[~single],
         np.stack([right, to_right, to_left], axis=1)[~single],
     ]
-    return _compact(np.concatenate([mesh.vertices, rim]), np.concatenate(pieces))
+    return _compact(np.concatenate([mesh.vertices, boundary]), np.concatenate(pieces))
 
 
 def drop_small_parts(mesh: Mesh, min_share: float) -> Mesh:

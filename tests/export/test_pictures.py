@@ -109,9 +109,9 @@ def test_a_mesh_is_lit_colored_and_dark_inside():
 def test_error_colors_are_the_map_s_ends():
     cloud = box_cloud()
     camera = frame_camera(cloud.points, size=SIZE)
-    low, high = map_colors(np.array([0.0, 1.0]), "viridis")
+    low, high = map_colors(np.array([0.0, 1.0]))
     for error, color in ((0.0, low), (0.02, high), (5.0, high)):
-        picture = render_error(cloud, np.full(len(cloud.points), error), 0.02, camera, "viridis")
+        picture = render_error(cloud, np.full(len(cloud.points), error), 0.02, camera)
         shown = picture[100:140, 70:90].reshape(-1, 3).mean(axis=0) / 255
         np.testing.assert_allclose(shown / shown.sum(), color / color.sum(), atol=0.05)
 
@@ -156,7 +156,6 @@ def test_wrong_arguments_are_named():
         "colors: expected": lambda: render_points(cloud, colors=(255, 0, 0)),
         "errors": lambda: render_error(cloud, np.zeros(3), 0.02),
         "max_error": lambda: render_error(cloud, np.zeros(len(cloud.points)), 0.0),
-        "colormap": lambda: map_colors(np.zeros(3), "rainbow road"),
         "rows": lambda: contact_sheet([]),
         "one size": lambda: contact_sheet([[picture, picture[:4]]]),
         "row_labels": lambda: contact_sheet([[picture]], ["a", "b"]),
