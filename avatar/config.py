@@ -28,12 +28,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from avatar.arguments import explain, refuse_code, tidy_arguments
+from avatar.arguments import explain, help_text, refuse_code, text_options, tidy_arguments
 from avatar.checks import AvatarError, check_trained
 from avatar.cli import leave_at_once, refuse, silence_closed_streams
 from avatar.declared import declared, method_settings
 from avatar.environment import prepared_process
-from avatar.help import help_text
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
 from avatar.io.documents import read_yaml
 from avatar.pipeline.endings import report_ending
@@ -41,7 +40,6 @@ from avatar.pipeline.outcomes import Outcome, State, ask_to_stop, is_stopping, n
 from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.signals import Stopped, leave_when_asked, listening
-from avatar.values import text_options
 from avatar.verbs import VERBS, Verb, resolve
 from avatar.world import current_world, torchrun_world
 

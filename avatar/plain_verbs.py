@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 from avatar.cli import refuse
 from avatar.declared import declared
-from avatar.invocation import command_line
-from avatar.values import expand, option
+from avatar.invocation import command_line, expand, option
 
 if TYPE_CHECKING:
     from avatar.pipeline.parameters import ParametersConfig

@@ -7,10 +7,11 @@ import types
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from avatar.checks import AvatarError, did_you_mean, sentences, unknown_name
 
+FileName = Annotated[str, "a name, or the path of a file"]
 Settings = TypeVar("Settings")
 
 

@@ -10,11 +10,12 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from avatar.arguments import tidy_arguments
+from avatar.arguments import TextOption, text_options, tidy_arguments
 from avatar.checks import AvatarError
 from avatar.config import CONF, register
 from avatar.declared import declared
-from avatar.values import FileName, TextOption, option, text_options
+from avatar.invocation import option
+from avatar.settings import FileName
 from avatar.verbs import VERBS
 
 LETTERS = r"""
