@@ -155,9 +155,9 @@ def run_settings(*options: str) -> RunConfig:
     Raises:
         AvatarError: for unknown options, naming the nearest, and values out of range.
     """
-    from avatar.config import compose_run  # hydra, which is not needed to load and pose an avatar
+    from avatar.config import compose_settings  # hydra, which is not needed to load and pose an avatar
 
-    return compose_run(list(options))
+    return compose_settings("train", *options)
 
 
 def to_mesh(surface: Surface | PointCloud, config: PoissonConfig | None = None) -> Mesh:

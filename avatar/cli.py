@@ -43,21 +43,17 @@ def main() -> NoReturn:
 
 
 def run(name: str, verb: Verb | None = None) -> NoReturn:
-    """Runs a verb with the arguments of the command line, and leaves with its exit code.
+    """Runs a verb, given where it is not in `VERBS`, with the arguments of the command line; leaves with its exit code.
 
     The code is 0, 2 for bad input or a missing package, 75 after a signal, or 141 where the reader of its output has
     left; faults of the program end in a traceback.
-
-    Args:
-        name: the verb's name.
-        verb: the verb, where it is not in `VERBS`.
     """
     for number in (signal.SIGINT, signal.SIGTERM):  # until the verb listens itself
         signal.signal(number, leave_at_once(name))
+    code: int | str | None = 0
     try:
         try:
             start(name, verb or VERBS[name])
-            code: int | str | None = 0
         except SystemExit as leaving:
             code = leaving.code
         sys.stdout.flush()
@@ -100,6 +96,12 @@ def start(name: str, verb: Verb) -> None:
             hint = environment_hint() or f" Run: {install_line(package)}"
             message = f"{package} is not installed for {sys.executable}.{hint}"
         sys.exit(refuse(name, message))
+    except ValueError as error:
+        from avatar.checks import AvatarError
+
+        if not isinstance(error, AvatarError):
+            raise
+        sys.exit(refuse(name, error))
 
 
 def refuse(name: str, message: object) -> int:

@@ -31,6 +31,7 @@ from omegaconf.errors import OmegaConfBaseException
 from avatar.arguments import explain, help_text, refuse_code, text_options, tidy_arguments
 from avatar.checks import AvatarError, check_trained
 from avatar.cli import leave_at_once, refuse, silence_closed_streams
+from avatar.data.folders import outfit_folder
 from avatar.declared import declared, method_settings
 from avatar.environment import prepared_process
 from avatar.invocation import PACKAGE, PIPE_CLOSED, STOPPED, checkout
@@ -73,27 +74,20 @@ def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
     return settings_from_dict(kind, plain)
 
 
-def compose_settings(name: str, *overrides: str, verb: Verb | None = None) -> Any:
-    """A verb's settings as the command line would give them with these overrides; within a verb's run as well."""
+def compose_settings(name: str, *options: str, verb: Verb | None = None) -> Any:
+    """A verb's settings as the command line would give them with these options; within a verb's run as well.
+
+    Raises `AvatarError` for unknown options, and values out of range or of another type.
+    """
     verb = verb or VERBS[name]
     register(name, verb)
+    words = tidy_arguments(list(options), texts=text_options(declared(verb.settings)))
     running = GlobalHydra.instance().is_initialized()
-    with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return to_settings(resolve(verb.settings), hydra.compose(name, list(overrides)))
-
-
-def compose_run(options: list[str]) -> Any:
-    """The settings of a training run, from options as they are written on the command line.
-
-    Raises:
-        AvatarError: for unknown options, and values out of range or of another type.
-    """
-    register("train")
-    options = tidy_arguments(options, texts=text_options(declared(VERBS["train"].settings)))
     try:
-        return compose_settings("train", *options)
+        with nullcontext() if running else hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            return to_settings(resolve(verb.settings), hydra.compose(name, words))
     except (HydraException, OmegaConfBaseException) as error:
-        raise AvatarError(explain(error, "train", options, CONF)) from error
+        raise AvatarError(explain(error, name, words, CONF)) from error
 
 
 def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | None = None) -> None:
@@ -102,12 +96,8 @@ def command(name: str, run: Callable[[Any], Any] | None = None, verb: Verb | Non
     Bad input ends in one line on standard error and exit code 2, not in a traceback; a signal that asks to stop in
     exit code 75 once all is saved. In a multirun, by whatever launcher, the other jobs go on after a failure; those
     that did not finish are named with the reason at the end, and the exit code is 2. After that the verb's ``then``
-    is called with the settings of the jobs that did finish, if any, unless the multirun was asked to stop.
-
-    Args:
-        name: the verb's name.
-        run: another function than the verb's own.
-        verb: the verb, where it is not in `VERBS`.
+    is called with the settings of the jobs that did finish, if any, unless the multirun was asked to stop. ``verb`` is
+    given where it is not in `VERBS`, and ``run`` for another function than the verb's own.
     """
     verb = verb or VERBS[name]
     journal = Path("runs/multirun").absolute() / f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{os.getpid()}"
@@ -173,10 +163,13 @@ def run_job(
     several = job.mode is RunMode.MULTIRUN
     line = " ".join([name, *OmegaConf.to_container(job.overrides.task, resolve=False)])
 
+    def note(state: State, **facts: Any) -> None:
+        if several:
+            note_outcome(journal, job.job.num, line, state, **facts)
+
     def end(state: State, why: str, code: int) -> None:
         print(f"{line}: {why}", file=sys.stderr)
-        if several:
-            note_outcome(journal, job.job.num, line, state, why)
+        note(state, why=why)
         if not several or (state is State.stopped and os.getpid() == parent):
             sys.exit(code)
 
@@ -184,11 +177,9 @@ def run_job(
         return end(State.stopped, "not begun.", STOPPED)
     if several and current_world().size > 1:
         return end(State.failed, "torchrun trains one run; leave out either it or --multirun.", 2)
-    if several:
-        note_outcome(journal, job.job.num, line, State.running)
+    note(State.running)
     try:
-        if isinstance(trained := getattr(to_settings(declared(verb.settings), config), "run", None), Path):
-            check_trained(trained / "avatar")  # a run that is not there is refused before its verb is imported
+        refuse_missing(to_settings(declared(verb.settings), config))
         leaving = (signal.SIGINT, signal.SIGTERM) if os.getpid() == parent else ()
         with listening(leave_at_once(name), leaving):
             settings, run = to_settings(resolve(verb.settings), config), run or resolve(verb.run)
@@ -216,9 +207,16 @@ def run_job(
             raise
         traceback.print_exc()
         return end(State.failed, f"{type(error).__name__}: {error}", 1)
-    if several:
-        note_outcome(journal, job.job.num, line, State.finished, settings=settings_to_dict(settings))
-    return None
+    return note(State.finished, settings=settings_to_dict(settings))
+
+
+def refuse_missing(settings: Any) -> None:
+    """Raises `DataError` for a run or an outfit that settings name and that is not there: before a verb is imported."""
+    if isinstance(run := getattr(settings, "run", None), Path):
+        check_trained(run / "avatar")
+    outfits = getattr(settings, "outfit", ()) if getattr(settings, "predictions", "own") else ()  # of a foreign program
+    for outfit in (outfits,) if isinstance(outfits, str) else outfits:
+        outfit_folder(settings.data_root or Path("data"), settings.dataset, outfit)
 
 
 class Lines(logging.StreamHandler):

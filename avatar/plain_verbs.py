@@ -6,13 +6,11 @@ import argparse
 import inspect
 import json
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from avatar.cli import refuse
 from avatar.declared import declared
 from avatar.invocation import command_line, expand, option
 
@@ -20,21 +18,13 @@ if TYPE_CHECKING:
     from avatar.pipeline.parameters import ParametersConfig
 
 
-def parser_of(verb: Callable[[], None]) -> argparse.ArgumentParser:
-    """A parser of a verb's arguments that describes it by its docstring."""
+def parse(verb: Callable[[], None], **arguments: dict[str, Any]) -> argparse.Namespace:
+    """What a verb's command line gives for its arguments, by their names; help describes the verb by its docstring."""
     text = inspect.cleandoc(verb.__doc__ or "")
-    return argparse.ArgumentParser(verb.__name__, description=text, formatter_class=argparse.RawTextHelpFormatter)
-
-
-@contextmanager
-def refusals(name: str) -> Iterator[None]:
-    """Ends the program with one line where the arguments of a verb are refused."""
-    from avatar.checks import AvatarError
-
-    try:
-        yield
-    except AvatarError as error:
-        sys.exit(refuse(name, error))
+    parser = argparse.ArgumentParser(verb.__name__, description=text, formatter_class=argparse.RawTextHelpFormatter)
+    for name, described in arguments.items():
+        parser.add_argument(f"--{name}" if "default" in described else name, **described)
+    return parser.parse_args()
 
 
 def path(text: str) -> Path:
@@ -42,11 +32,14 @@ def path(text: str) -> Path:
     return Path(expand(text))
 
 
+TARGET = {"type": path, "help": "the .npz to write"}
+
+
 def doctor() -> None:
     """Prints what is installed, what is missing and the command that installs it; exits with 1 if a needed part is."""
     from avatar.environment import accelerator, inspect_machine
 
-    parser_of(doctor).parse_args()
+    parse(doctor)
     findings = inspect_machine()
     for finding in findings:
         mark = "ok " if finding.present else ("MISSING" if finding.needed else "absent ")
@@ -64,16 +57,15 @@ def convert_body() -> None:
     convert_body SMPL_NEUTRAL.pkl data/bodies/smpl_neutral.npz --uv smpl_uv.obj
     convert_body data/theirs/coat/template.npz with_uv.npz --uv body.obj
     """
-    parser = parser_of(convert_body)
-    parser.add_argument("source", type=path, help="the downloaded model, .npz or .pkl")
-    parser.add_argument("target", type=path, help="the .npz to write")
-    parser.add_argument("--uv", type=path, help="an OBJ of the same mesh whose texture coordinates POP is to use")
-    paths = parser.parse_args()
-
+    paths = parse(
+        convert_body,
+        source={"type": path, "help": "the downloaded model, .npz or .pkl"},
+        target=TARGET,
+        uv={"type": path, "default": None, "help": "an OBJ of the same mesh whose texture coordinates POP is to use"},
+    )
     from avatar.body.smpl import convert_body_model
 
-    with refusals("convert_body"):
-        kind = convert_body_model(paths.source, paths.target, paths.uv)
+    kind = convert_body_model(paths.source, paths.target, paths.uv)
     print(f"{paths.target}: {kind} body, {paths.target.stat().st_size / 1e6:.1f} MB")
     name = json.dumps(str(paths.target.resolve()), ensure_ascii=False)
     print(f"Name it in the outfit.yaml of packed data (docs/data.md), as body: {{path: {name}}}")
@@ -84,19 +76,15 @@ def make_body() -> None:
 
     make_body data/bodies/tall.npz --height 0.9 --weight 0.7
     """
-    parser = parser_of(make_body)
-    parser.add_argument("target", type=path, help="the .npz to write")
-    for parameter in fields(declared("avatar.body.anny:Phenotype")):
-        parser.add_argument(f"--{parameter.name}", type=float, default=parameter.default)
-    options = vars(parser.parse_args())
+    parameters = fields(declared("avatar.body.anny:Phenotype"))
+    shape = {parameter.name: {"type": float, "default": parameter.default} for parameter in parameters}
+    options = vars(parse(make_body, target=TARGET, **shape))
     target = options.pop("target")
-
     from avatar.body.anny import Phenotype, anny_body
     from avatar.body.packed import write_body
 
-    with refusals("make_body"):
-        body = anny_body(Phenotype(**options))
-        write_body(target, body)
+    body = anny_body(Phenotype(**options))
+    write_body(target, body)
     height = float(body.template.vertices[:, 1].max() - body.template.vertices[:, 1].min())
     print(f"{target}: {len(body.template.vertices):,} vertices, {height:.2f} m tall")
 
@@ -107,19 +95,14 @@ def make_motion() -> None:
     make_motion walk walk.npz
     make_motion dance data/motions/dance.npz --seconds 10 --fps 60
     """
-    parser = parser_of(make_motion)
-    parser.add_argument("name", help="walk, squat, twist, reach, kick, bend or dance")
-    parser.add_argument("target", type=path, help="the .npz to write")
-    parser.add_argument("--seconds", type=float, default=6.0)
-    parser.add_argument("--fps", type=float, default=30.0)
-    options = parser.parse_args()
-
+    name = {"help": "walk, squat, twist, reach, kick, bend or dance"}
+    seconds, fps = ({"type": float, "default": value} for value in (6.0, 30.0))
+    options = parse(make_motion, name=name, target=TARGET, seconds=seconds, fps=fps)
     from avatar.io.motions import write_motion
     from avatar.simulate.sequences import authored_motion
 
-    with refusals("make_motion"):
-        motion = authored_motion(options.name, options.fps, options.seconds)
-        write_motion(options.target, motion)
+    motion = authored_motion(options.name, options.fps, options.seconds)
+    write_motion(options.target, motion)
     print(f"{options.target}: {len(motion.poses)} frames, {options.fps:g} a second")
 
 
@@ -128,17 +111,13 @@ def pack() -> None:
 
     pack data/open/tee data/packed/tee
     """
-    parser = parser_of(pack)
-    parser.add_argument("source", type=path, help="the outfit's folder")
-    parser.add_argument("target", type=path, help="the folder to write")
-    paths = parser.parse_args()
-
+    source, target = ({"type": path, "help": text} for text in ("the outfit's folder", "the folder to write"))
+    paths = parse(pack, source=source, target=target)
     from avatar.data.folders import SPLITS
     from avatar.data.layouts import open_outfit_folder
     from avatar.data.packed_layout import write_packed_outfit
 
-    with refusals("pack"):
-        packed = write_packed_outfit(open_outfit_folder(paths.source), paths.target)
+    packed = write_packed_outfit(open_outfit_folder(paths.source), paths.target)
     count = sum(len(packed.frames(split)) for split in SPLITS if packed.has_frames(split))
     where = {"dataset": paths.target.parent.name, "outfit": paths.target.name, "data_root": paths.target.parent.parent}
     print(f"{paths.target}: {count} frames")
@@ -151,7 +130,7 @@ def parameters(config: ParametersConfig) -> list[Path]:
     from avatar.config import CONF, compose_settings
     from avatar.pipeline.parameters import write_parameters
 
-    methods = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
+    methods = sorted(file.stem for file in (CONF / "method").glob("*.yaml"))
     choices = {
         (method, size): compose_settings("train", f"method={method}", f"size={size}").method
         for size in ("full", "small")

@@ -41,9 +41,16 @@ def test_help_needs_neither_torch_nor_two_seconds(verb):
 
 
 def test_a_mistake_is_found_before_torch_is_imported():
-    for words in (("train", "train.stepz=1"), ("train", "train.steps=many"), ("predict", "run=nowhere")):
-        code, _, err, _ = ask(*words)
-        assert code == 2 and " torch\n" not in err
+    mistakes = {
+        "train.stepz=1": "no such option",
+        "train.steps=many": "expected int",
+        "outfit=nowhere": "no such outfit",
+    }
+    for words in (*(("train", word) for word in mistakes), ("predict", "run=nowhere"), ("demo", "outfit=[dress,coat]")):
+        before = children_seconds()
+        code, _, err, after = ask(*words)
+        assert code == 2 and " torch\n" not in err and mistakes.get(words[1], "no such") in err
+        assert after - before < SECONDS
 
 
 @pytest.mark.parametrize("verb", WITH_OPTIONS)
