@@ -1,7 +1,4 @@
-"""How far a loop is: a bar on a terminal, a line now and then elsewhere; and a count of what this process has done.
-
-Lines are logged, so that a caller from Python hears them if it listens.
-"""
+"""Progress of loops, a bar on a terminal and logged lines elsewhere; and a count of what this process has done."""
 
 from __future__ import annotations
 
@@ -22,7 +19,11 @@ report = logging.getLogger(__name__)
 
 
 class Progress:
-    """A loop of ``total`` pieces of work that a budget of seconds may end before; a context manager."""
+    """A loop of ``total`` pieces of work, ``done`` of them earlier; a context manager.
+
+    It also ends with a ``budget`` of seconds, if not None, of which some were ``spent`` earlier. ``silent`` shows
+    nothing, for processes other than the main one.
+    """
 
     def __init__(
         self,
@@ -34,17 +35,6 @@ class Progress:
         spent: float = 0.0,
         silent: bool = False,
     ):
-        """Begins a loop.
-
-        Args:
-            what: the loop, for the user.
-            total: pieces of work at most.
-            unit: of one piece.
-            done: pieces that were finished earlier.
-            budget: seconds of work after which it ends as well; None for no limit.
-            spent: seconds of it that were spent earlier.
-            silent: show nothing (processes beside the leading one).
-        """
         self.what, self.total, self.unit, self.done, self.before = what, total, unit, done, done
         self.budget, self.spent, self.silent = budget, spent, silent
         self.started = self.logged = time.monotonic()
@@ -118,11 +108,7 @@ def tracked(
 
 def in_words(seconds: float) -> str:
     """A time for people: ``35 s``, ``12 min 5 s``, ``3 h 20 min``."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+    minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if minutes else f"{hours} h"
+    parts = [(hours, "h"), (minutes, "min"), (rest if not hours else 0, "s")]
+    return " ".join(f"{count} {unit}" for count, unit in parts if count) or "0 s"

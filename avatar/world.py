@@ -1,9 +1,8 @@
 """Data-parallel processes under torchrun: ranks, shards of a batch, and the collectives that training needs.
 
-Gradients are averaged, the statistics of every normalisation are those of the whole batch (`nn.layers`), and what
-is computed once an outfit is computed for all outfits of the step in every process; so a run gives the losses and
-gradients of one process with the same batch, to rounding (with noise on the input: in distribution). NCCL serves CUDA,
-gloo the CPU. torch is imported where it is needed, for every command asks for its world, and help needs no torch.
+Gradients are averaged, normalisations have the whole batch's statistics (`nn.layers`), and every process computes what
+is computed once an outfit for all outfits of the step; so a run has the losses and gradients of one process with the
+same batch, to rounding (with noise on the input: in distribution). Help needs no torch, so it is imported where needed.
 """
 
 from __future__ import annotations
@@ -34,15 +33,10 @@ class World:
         return self.rank == 0
 
     def shard(self, batch: int) -> slice:
-        """The frames of a batch that this process trains on.
-
-        Raises:
-            AvatarError: when a batch cannot be divided evenly.
-        """
+        """The frames of a batch that this process trains on; raises `AvatarError` if they cannot be divided evenly."""
         if batch % self.size:
             raise AvatarError(f"batch: expected a multiple of the {self.size} processes, got {batch}.")
-        count = batch // self.size
-        return slice(self.rank * count, (self.rank + 1) * count)
+        return slice(self.rank * batch // self.size, (self.rank + 1) * batch // self.size)
 
 
 def current_world() -> World:
@@ -75,11 +69,7 @@ def torchrun_world() -> Iterator[World]:
 
 
 def require_single_process(what: str) -> None:
-    """Check that torchrun started no other processes, for jobs that train in one.
-
-    Raises:
-        AvatarError: in every process where there are several.
-    """
+    """Raises `AvatarError` in every process where torchrun started several, for jobs that train in one."""
     if current_world().size > 1:
         raise AvatarError(f"{what}: expected one process, got {current_world().size}. Hint: start it without torchrun.")
 
