@@ -12,7 +12,7 @@ import pytest
 from avatar.environment import inspect_package, install_hint
 from avatar.invocation import interpreter
 from avatar.runs.canonicalizing import canonicalize_frames, train_canonicalizer
-from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.prediction import predict_frames
 from avatar.runs.training import fit_outfit
 from avatar.runs.training import train as train_run
 from avatar.verbs import VERBS, resolve
@@ -149,8 +149,7 @@ def test_who_imports_torch_too_early_is_warned_once(first):
 
 def test_all_that_verbs_and_callers_of_the_package_start_prepares_the_process():
     """Every verb with settings, and the functions that the docs call from Python."""
-    started = [train_run, train_canonicalizer, canonicalize_frames, fit_outfit]
-    started += [predict_frames, predict_motion]
+    started = [train_run, train_canonicalizer, canonicalize_frames, fit_outfit, predict_frames]
     started += [resolve(verb.run) for name, verb in VERBS.items() if verb.settings and name != "parameters"]
     started += [resolve(verb.run) for verb in (BENCH, CHECK_RELIABILITY)]
     assert len(started) > 20

@@ -29,7 +29,7 @@ from avatar.methods.canonicalizer import (
     load_canonicalizer,
 )
 from avatar.progress import tracked
-from avatar.records import CanonicalScan, Mesh, PointCloud, Template
+from avatar.records import Mesh, PointCloud, Template
 from avatar.runs.training import save_settings
 from avatar.settings import settings_to_dict
 from avatar.training.trainer import Trainer, spent
@@ -87,8 +87,7 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
     frames = frames or config.frames()
     template = frames.outfits[0].template
     source, made_by = skinning_source(config, template), scans_digest(config)
-    done = Ledger(config.folder / "scans")
-    written = []
+    written, done = [], Ledger(config.folder / "scans")
     for index, where in enumerate(tracked(frames.names, "canonicalize", unit="scan")):
         path = config.folder / "scans" / where.split / f"{where.name}.npz"
         written.append(path)
@@ -102,7 +101,10 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
         files = [path]
         if where.split == "train":
             files.append(path.with_suffix(".ply"))
-            write_surface(files[-1], scan)
+            if scan.faces is None:
+                write_points(files[-1], PointCloud(scan.points, scan.normals))
+            else:
+                write_mesh(files[-1], Mesh(scan.points, scan.faces, scan.colors))
         write_canonical_scan(path, scan)
         done.record(name, key, files)
     return written
@@ -122,11 +124,3 @@ def scans_digest(config: CanonicalizeConfig) -> str:
     if config.weights is WeightSource.learned:
         parts["learned"] = file_digest(config.folder / f"{WEIGHTS}.safetensors")
     return keyed(SOURCE, program=module_digest(__name__), **parts)
-
-
-def write_surface(path: Path, scan: CanonicalScan) -> None:
-    """A canonical scan for other programs: a mesh where it is one, oriented points otherwise."""
-    if scan.faces is None:
-        write_points(path, PointCloud(scan.points, scan.normals))
-    else:
-        write_mesh(path, Mesh(scan.points, scan.faces, scan.colors))
