@@ -16,7 +16,6 @@ from contextlib import suppress
 from dataclasses import dataclass, is_dataclass
 from enum import EnumType
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import hydra
@@ -29,7 +28,7 @@ from omegaconf import OmegaConf
 
 from avatar.checks import AvatarError, DataError, did_you_mean, sentences, unknown_name
 from avatar.declared import comments, declared, method_settings
-from avatar.invocation import command_line, expand, install_line, quote
+from avatar.invocation import CONF, command_line, expand, install_line, quote
 from avatar.io.documents import check_events, read_yaml
 from avatar.settings import FileName
 from avatar.verbs import OPTIONS, SHARED, Verb
@@ -73,13 +72,11 @@ def text_options(kind: type, prefix: str = "") -> dict[str, TextOption]:
     return found
 
 
-def tidy_arguments(
-    arguments: list[str], sweeps: bool = False, texts: Mapping[str, TextOption] = MappingProxyType({})
-) -> list[str]:
+def tidy_arguments(arguments: list[str], texts: Mapping[str, TextOption], sweeps: bool = False) -> list[str]:
     """Arguments as Hydra takes them: flags first, lists that a shell split at a blank joined again, texts in quotes.
 
-    ``sweeps`` says whether the verb is a multirun without being asked for one; ``texts`` are its options that hold
-    text. Raises `AvatarError` for unknown flags and words that are no option, with the form to write instead.
+    ``texts`` are the verb's options that hold text; ``sweeps`` says whether it is a multirun without being asked for
+    one. Raises `AvatarError` for unknown flags and words that are no option, with the form to write instead.
     """
 
     def refuse(message: str) -> None:
@@ -220,13 +217,13 @@ def refuse_code(arguments: list[str]) -> None:
                     raise DataError(path, f"{word!r:.100} could run code or read the environment: not read.", hint)
 
 
-def known_options(verb: str, overrides: list[str], conf: Path) -> tuple[dict[str, Any], dict[str, str]]:
+def known_options(verb: str, overrides: list[str]) -> tuple[dict[str, Any], dict[str, str]]:
     """A verb's options as a command line sets them, nested, and the files it chooses by their groups.
 
     Raises `HydraException` for a command line that cannot be composed.
     """
     GlobalHydra.instance().clear()
-    with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         config = hydra.compose(verb, overrides, return_hydra_config=True)
     chosen = {str(name): choice for name, choice in config.hydra.runtime.choices.items()}
     choices = {name: choice for name, choice in chosen.items() if name.partition("/")[0] not in ("hydra", *FOLLOWING)}
@@ -234,26 +231,26 @@ def known_options(verb: str, overrides: list[str], conf: Path) -> tuple[dict[str
     return {name: value for name, value in plain.items() if name != "hydra"}, choices
 
 
-def explain(error: Exception, verb: str, arguments: list[str], conf: Path) -> str:
+def explain(error: Exception, verb: str, arguments: list[str]) -> str:
     """What is wrong with a verb's command line in one sentence, from Hydra's or OmegaConf's error."""
     text = str(error).partition("\n")[0]
     if isinstance(error, MissingConfigException) and "/" in (error.missing_cfg_file or ""):
         group, _, choice = error.missing_cfg_file.rpartition("/")
         if choice in PLUGINS:
             return f"{group}: {choice} is not installed. Run: {install_line('hydra_plugins')}"
-        choices = error.options or sorted(path.stem for path in (conf / group).glob("*.yaml"))
+        choices = error.options or sorted(path.stem for path in (CONF / group).glob("*.yaml"))
         known = [name for name in choices if not name.endswith("_defaults")]
         return str(unknown_name(group, choice, known)) if known else f"{group}: no option {choice!r}."
     named = re.match(r"Could not (?:override|delete from config\.) '([^']+)'", text)
     if not named:
         return f"{error.full_key}: {text}" if getattr(error, "full_key", None) else text
     name = named[1].partition("@")[0]
-    groups = [str(path.relative_to(conf)) for path in conf.glob("*/")]
+    groups = [str(path.relative_to(CONF)) for path in CONF.glob("*/")]
     chosen = [word for word in arguments if word.partition("=")[0] in groups and not name.startswith(word)]
     try:
-        options, choices = known_options(verb, chosen, conf)
+        options, choices = known_options(verb, chosen)
     except HydraException:
-        options, choices = known_options(verb, [], conf)
+        options, choices = known_options(verb, [])
     options = dict.fromkeys(group for group in choices if "@" not in group) | options
     dotted = [option for option, _ in _dotted(options)]
     leaf = [other for other in dotted if other.rpartition(".")[2] == name]
@@ -272,16 +269,16 @@ def _dotted(options: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield from _dotted(value, f"{prefix}{name}.")
 
 
-def help_text(name: str, verb: Verb, overrides: list[str], conf: Path) -> str:
+def help_text(name: str, verb: Verb, overrides: list[str]) -> str:
     """What ``--help`` prints for a verb whose defaults are registered: the options that matter, files, all options."""
-    options, choices = known_options(name, overrides, conf)
+    options, choices = known_options(name, overrides)
     known = meanings(declared(verb.settings), options)
-    main = [(option, *main_option(option, options, choices, known, conf)) for option in OPTIONS.get(name, "").split()]
+    main = [(option, *main_option(option, options, choices, known)) for option in OPTIONS.get(name, "").split()]
     lines = [f"usage: {command_line(name)} [OPTION=VALUE ...]", f"{verb.does[0].upper()}{verb.does[1:]}."]
     lines += ["", *_columns([(f"{option}={value}", meaning) for option, value, meaning in main])] if main else []
     lines += ["", "Files to choose from:"] if choices else []
     for group in choices:
-        paths = sorted((conf / group.partition("@")[0]).glob("*.yaml"))
+        paths = sorted((CONF / group.partition("@")[0]).glob("*.yaml"))
         lines += [f"  {group}=", *(f"  {line}" for line in _columns([(path.stem, _about(path)) for path in paths]))]
     lines += ["", "All options:"]
     for option, value in _dotted(options):
@@ -291,12 +288,10 @@ def help_text(name: str, verb: Verb, overrides: list[str], conf: Path) -> str:
     return "\n".join([*lines, "", OVERRIDING])
 
 
-def main_option(
-    name: str, options: dict[str, Any], choices: dict[str, str], known: dict[str, str], conf: Path
-) -> tuple[str, str]:
+def main_option(name: str, options: dict[str, Any], choices: dict[str, str], known: dict[str, str]) -> tuple[str, str]:
     """The value and the meaning of an option, or of the choice of a file."""
     if name in choices:
-        path = conf / name.partition("@")[0] / f"{choices[name]}.yaml"
+        path = CONF / name.partition("@")[0] / f"{choices[name]}.yaml"
         return choices[name], _about(path) if path.is_file() else ""
     return _written(dict(_dotted(options))[name]), known[name]
 

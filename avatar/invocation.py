@@ -37,6 +37,9 @@ def checkout() -> Path | None:
     return root if (root / "setup.cfg").is_file() and (root / "tools").is_dir() else None
 
 
+CONF = (checkout() or PACKAGE) / "conf"  # a wheel has it in the package
+
+
 def install_line(package: str) -> str:
     """The shell command that installs an imported package for this interpreter, with what goes with it.
 

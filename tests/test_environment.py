@@ -22,6 +22,8 @@ from reliability.small_jobs import weights_digest, write_data
 
 ROOT = Path(__file__).parents[1]
 TWO_THREADS = {"OMP_NUM_THREADS": "2"}
+WORK = "avatar.verbs.Verb('', '__main__:work', 'avatar.pipeline.parameters:ParametersConfig')"
+RUN_WORK = f"import avatar.verbs; command('parameters', {WORK})"
 
 
 def test_a_package_that_is_there_is_named_with_its_version():
@@ -81,8 +83,8 @@ def test_every_verb_keeps_freed_memory_for_what_comes_next():
         "    for _ in range(3): torch.ones(1 << 24)\n"
         "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before\n"
         "print(min(faults() for _ in range(8)))\n"
-        "command('parameters', lambda config: print(min(faults() for _ in range(8))) or [])"
-    )
+        "def work(config): print(min(faults() for _ in range(8)))\n"
+    ) + RUN_WORK
     thrown_away, kept = map(int, in_fresh_python(code).stdout.split())
     assert thrown_away > 3 * 10_000 and kept < 1000
 
@@ -102,7 +104,8 @@ def test_every_verb_takes_the_smallest_numbers_for_zero_in_all_threads():
     code = LEFT + (
         "from avatar.config import command\n"
         "print(left())\n"
-        "try: command('parameters', lambda config: print(left()) or [])\n"
+        "def work(config): print(left())\n"
+        f"try: {RUN_WORK}\n"
         "except SystemExit: print(left())"
     )
     assert in_fresh_python(code, **TWO_THREADS).stdout.split() == [str(1 << 20), "0", str(1 << 20)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from avatar.arguments import help_text, known_options, main_option, meanings
-from avatar.config import CONF, register
+from avatar.config import register
 from avatar.declared import declared
 from avatar.verbs import OPTIONS, SHARED, VERBS
 
@@ -58,18 +58,18 @@ def test_a_mistake_is_found_before_torch_is_imported():
 @pytest.mark.parametrize("verb", WITH_OPTIONS)
 def test_the_options_that_matter_exist_and_mean_something(verb):
     register(verb)
-    options, choices = known_options(verb, [], CONF)
+    options, choices = known_options(verb, [])
     known = meanings(declared(VERBS[verb].settings), options)
     assert VERBS[verb].settings and len(OPTIONS[verb].split()) <= 12
     for name in OPTIONS[verb].split():
-        assert main_option(name, options, choices, known, CONF)[1], name
+        assert main_option(name, options, choices, known)[1], name
 
 
 def test_shared_meanings_are_of_options_that_lack_one():
     known: dict[str, list[str]] = {name: [] for name in SHARED}
     for verb in WITH_OPTIONS:
         register(verb)
-        options, _ = known_options(verb, [], CONF)
+        options, _ = known_options(verb, [])
         for name, meaning in meanings(declared(VERBS[verb].settings), options).items():
             known.setdefault(name, []).append(meaning)
     assert all(known[name].count(meaning) > 1 for name, meaning in SHARED.items() if name != "seed")
@@ -77,7 +77,7 @@ def test_shared_meanings_are_of_options_that_lack_one():
 
 def test_help_shows_what_the_command_line_chooses():
     register("train")
-    text = help_text("train", VERBS["train"], ["method=pop", "train.minutes=3"], CONF)
+    text = help_text("train", VERBS["train"], ["method=pop", "train.minutes=3"])
     assert re.search(r"\n  method=pop +POP: features in the UV plane", text) and "\n  train.minutes=3  " in text
     assert "\n    closet_learned    CloSET skinned by" in text and "\n      map_size: 64" in text
     assert "\n      chamfer: plane  # point, plane\n" in text and "method_size" not in text and "_defaults" not in text

@@ -29,7 +29,7 @@ LIKE_QUOTES = ["'q'", '"q"', "~", "~/a"]  # or like the home folder: as they are
 
 def tidy(verb: str, *words: str) -> list[str]:
     """Words of a command line as Hydra gets them."""
-    return tidy_arguments(list(words), texts=text_options(declared(VERBS[verb].settings)))
+    return tidy_arguments(list(words), text_options(declared(VERBS[verb].settings)))
 
 
 def read(verb: str, *words: str) -> dict:

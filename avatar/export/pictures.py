@@ -59,12 +59,6 @@ class Camera:
         right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
         return np.stack([right, np.cross(towards, right), towards])
 
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixel coordinates ``(N, 2)``, column and row from the upper left corner, of ``(N, 3)`` points."""
-        across, up, _ = self.axes @ (np.asarray(points, np.float64) - self.center).T
-        scale = self.size[1] / self.extent
-        return np.stack([self.size[0] / 2 + across * scale, self.size[1] / 2 - up * scale], axis=1)
-
     def seen_from(self, view: str) -> Camera:
         """The same framing from front, left, back, right, side (the left) or three_quarter."""
         if view not in AZIMUTHS:
