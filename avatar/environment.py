@@ -107,15 +107,6 @@ def choose_device(name: str) -> torch.device:
         raise AvatarError(f"device: expected auto, cpu or a CUDA device there is, got {name!r} ({reason}).") from error
 
 
-def accelerator() -> str:
-    """What torch would train on, in words."""
-    import torch
-
-    if accelerator_type() == "cuda":
-        return f"CUDA {torch.version.cuda}: {torch.cuda.get_device_name()}"
-    return f"CPU with {torch.get_num_threads()} threads"
-
-
 @contextmanager
 def prepared_process() -> Iterator[None]:
     """Prepares the process for work on the CPU, as a ``with`` block or as the decorator of every function that does it.
@@ -139,9 +130,8 @@ def prepared_process() -> Iterator[None]:
 def flush_denormals(on: bool) -> None:
     """Has this thread, and the OpenMP threads that work for it, take such numbers for zero, or count them in full.
 
-    The processor has this switch in each thread, and a new thread takes over that of the one that starts it. So
-    OpenMP's idle threads are ended: the next ones are started from this thread when there is work. A forked process
-    has none of its parent's threads and must not wait for them.
+    New threads take over this processor setting from the one that starts them, so OpenMP's idle threads are ended. A
+    forked process has none of its parent's threads and must not wait for them.
     """
     import torch
 

@@ -37,7 +37,7 @@ TARGET = {"type": path, "help": "the .npz to write"}
 
 def doctor() -> None:
     """Prints what is installed, what is missing and the command that installs it; exits with 1 if a needed part is."""
-    from avatar.environment import accelerator, inspect_machine
+    from avatar.environment import accelerator_type, inspect_machine
 
     parse(doctor)
     findings = inspect_machine()
@@ -46,7 +46,10 @@ def doctor() -> None:
         print(f"{mark:8}{finding.name:42}{finding.seen}" + ("" if finding.present else f"\n{'':8}-> {finding.hint}"))
     lacking = [finding.name for finding in findings if finding.needed and not finding.present]
     if not lacking:
-        print(f"training would run on: {accelerator()}")
+        import torch
+
+        cuda = accelerator_type() == "cuda" and f"CUDA {torch.version.cuda}: {torch.cuda.get_device_name()}"
+        print(f"training would run on: {cuda or f'CPU with {torch.get_num_threads()} threads'}")
     sys.exit(bool(lacking))
 
 

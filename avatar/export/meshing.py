@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import multiprocessing
 import threading
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -196,7 +195,6 @@ class MeshingReport:
     done: tuple[str, ...] = ()
     skipped: tuple[str, ...] = ()
     failed: dict[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
 
 
 def mesh_folder(
@@ -213,7 +211,6 @@ def mesh_folder(
     ``formats`` are among ply, obj, glb, stl, off; ``frames`` names to mesh, or None for all. Raises `DataError` when
     there is nothing to mesh or a named frame is missing; `AvatarError` for another format, or without open3d.
     """
-    started = time.monotonic()
     unknown = [ending for ending in formats if f".{ending}" not in FORMATS]
     if unknown or not formats:
         raise AvatarError(f"formats: expected some of {' '.join(FORMATS)} without the dot, got {tuple(formats)}.")
@@ -244,4 +241,4 @@ def mesh_folder(
                 write_mesh(target, mesh)
             ledger.record(name, key, targets)
             done.append(name)
-    return MeshingReport(tuple(done), tuple(skipped), failed, time.monotonic() - started)
+    return MeshingReport(tuple(done), tuple(skipped), failed)
