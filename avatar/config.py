@@ -15,7 +15,7 @@ import traceback
 from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -42,7 +42,6 @@ from avatar.training.signals import Stopped, leave_when_asked, listening
 from avatar.verbs import VERBS, Verb, resolve
 from avatar.world import current_world, torchrun_world
 
-Settings = TypeVar("Settings")
 report = logging.getLogger(__name__)
 
 
@@ -65,10 +64,9 @@ def register(name: str, verb: Verb | None = None) -> None:
         store.store(name=name, node=read_yaml(verb.conf))
 
 
-def to_settings(kind: type[Settings], config: DictConfig) -> Settings:
+def to_settings(kind: type, config: DictConfig) -> Any:
     """A composed config as its settings class."""
-    plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    return settings_from_dict(kind, plain)
+    return settings_from_dict(kind, OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
 
 
 def compose_settings(name: str, *options: str, verb: Verb | None = None) -> Any:

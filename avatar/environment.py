@@ -29,15 +29,9 @@ report = logging.getLogger(__name__)
 APT_PACKAGES = {"libusb-1.0": "libusb-1.0-0", "libGL.so": "libgl1", "libEGL.so": "libegl1", "libX11.so": "libx11-6"}
 APT_PACKAGES |= {"libudev.so": "libudev1", "libidn2.so": "libidn2-0", "libgomp.so": "libgomp1"}
 APT_PACKAGES |= {"libXrender.so": "libxrender1"}
-OPTIONAL = {
-    "open3d": "meshing",
-    "pyvista": "pictures",
-    "pygltflib": "rigged GLB export",
-    "pxr": "USD export",
-    "tensorboard": "training curves in TensorBoard",
-    "newton": "simulating new outfits",
-    "anny": "bodies of other shapes",
-}
+OPTIONAL = {"open3d": "meshing", "pyvista": "pictures", "pygltflib": "rigged GLB export", "pxr": "USD export"}
+OPTIONAL |= {"tensorboard": "training curves in TensorBoard", "newton": "simulating new outfits"}
+OPTIONAL |= {"anny": "bodies of other shapes"}
 
 
 @dataclass(frozen=True)
@@ -53,10 +47,9 @@ class Finding:
 
 def inspect_machine() -> list[Finding]:
     """Looks at Python, packages, system libraries and accelerators; imports each package in its own process."""
-    version = platform.python_version()
     browser, hint = shutil.which("chromium") or shutil.which("google-chrome"), "apt-get install -y chromium"
     return [
-        Finding("python", sys.version_info >= (3, 11), version, "install Python 3.11 or newer"),
+        Finding("python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer"),
         *(inspect_package(name, "core", needed=True) for name in CORE),
         *(inspect_package(name, use, needed=False) for name, use in OPTIONAL.items()),
         Finding("chromium", bool(browser), browser or "not found", hint, needed=False),

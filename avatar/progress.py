@@ -8,6 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Self, TypeVar
 
 from tqdm import tqdm
@@ -18,29 +19,23 @@ WORK: Counter[str] = Counter()  # of this process: `step`s trained, pieces `made
 report = logging.getLogger(__name__)
 
 
+@dataclass
 class Progress:
-    """A loop of ``total`` pieces of work, ``done`` of them earlier; a context manager.
+    """A loop of ``total`` pieces of work that a budget may end before; a context manager."""
 
-    It also ends with a ``budget`` of seconds, if not None, of which some were ``spent`` earlier. ``silent`` shows
-    nothing, for processes other than the main one.
-    """
+    what: str
+    total: int
+    unit: str = "frame"
+    done: int = 0  # pieces finished earlier
+    budget: float | None = None  # seconds of work after which it ends as well
+    spent: float = 0.0  # seconds of it that were spent earlier
+    silent: bool = False  # for processes other than the main one
 
-    def __init__(
-        self,
-        what: str,
-        total: int,
-        unit: str = "frame",
-        done: int = 0,
-        budget: float | None = None,
-        spent: float = 0.0,
-        silent: bool = False,
-    ):
-        self.what, self.total, self.unit, self.done, self.before = what, total, unit, done, done
-        self.budget, self.spent, self.silent = budget, spent, silent
+    def __post_init__(self):
+        self.before, self.values, self.logged_count = self.done, "", -1
         self.started = self.logged = time.monotonic()
-        self.values, self.logged_count = "", -1
-        watched = not silent and sys.stderr.isatty()
-        self.bar = tqdm(total=total, initial=done, desc=what, unit=unit) if watched else None
+        watched = not self.silent and sys.stderr.isatty()
+        self.bar = tqdm(total=self.total, initial=self.done, desc=self.what, unit=self.unit) if watched else None
 
     def __enter__(self) -> Self:
         return self

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
@@ -20,19 +20,22 @@ def map_tensors(record: Record, change: Callable[[Tensor], Tensor]) -> Record:
     return replace(record, **{name: change(value) for name, value in values.items() if isinstance(value, Tensor)})
 
 
-def _moved(record: Record, *args, **kwargs) -> Record:
-    """The same record with its floating-point tensors moved or cast by `Tensor.to`, and its indices moved only."""
+class Tensors:
+    """A record of tensors that are moved and cast together."""
 
-    def move(tensor: Tensor) -> Tensor:
-        if tensor.is_floating_point():
-            return tensor.to(*args, **kwargs)
-        return tensor.to(tensor.new_empty(0, dtype=torch.float32).to(*args, **kwargs).device)
+    def to(self, *args, **kwargs) -> Self:
+        """The same record with floating-point tensors moved or cast by `Tensor.to`, and indices moved only."""
 
-    return map_tensors(record, move)
+        def move(tensor: Tensor) -> Tensor:
+            if tensor.is_floating_point():
+                return tensor.to(*args, **kwargs)
+            return tensor.to(tensor.new_empty(0, dtype=torch.float32).to(*args, **kwargs).device)
+
+        return map_tensors(self, move)
 
 
 @dataclass(frozen=True)
-class Template:
+class Template(Tensors):
     """A body at rest in its canonical pose: metres, right-handed, y up, facing +z."""
 
     vertices: Tensor  # (V, 3)
@@ -44,10 +47,6 @@ class Template:
     canonical_from_bind: Tensor | None = None  # (J, 4, 4) from the pose of the weights; None if canonical
     uv: Tensor | None = None  # (U, 2) in [0, 1]; None for a body without atlas
     uv_faces: Tensor | None = None  # (F, 3) each corner's index into uv
-
-    def to(self, *args, **kwargs) -> Template:
-        """The same template with its floating-point tensors moved or cast, and its faces moved only."""
-        return _moved(self, *args, **kwargs)
 
 
 @dataclass(frozen=True)
@@ -114,20 +113,16 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class SurfaceSamples:
+class SurfaceSamples(Tensors):
     """Points on a triangle mesh."""
 
     vertex_ids: Tensor  # (N, 3) corner vertices
     barycentric: Tensor  # (N, 3) rows sum to 1
     face_ids: Tensor  # (N,) which triangle each point lies on
 
-    def to(self, *args, **kwargs) -> SurfaceSamples:
-        """The same samples with weights moved or cast, and indices moved only."""
-        return _moved(self, *args, **kwargs)
-
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(Tensors):
     """Frames of one body topology, stacked for training.
 
     ``canonical`` is True where ``vertices``, ``vertex_transforms`` and scans are those of the canonical pose (training
@@ -149,10 +144,6 @@ class Batch:
     def outfits(self) -> Tensor:
         """The outfits ``(O,)`` that a network encodes for this step, ascending: each once, in whatever share it is."""
         return self.outfit_ids.unique() if self.step_outfits is None else self.step_outfits
-
-    def to(self, device: torch.device | str) -> Batch:
-        """The same batch on another device."""
-        return map_tensors(self, lambda tensor: tensor.to(device))
 
 
 @dataclass(frozen=True)

@@ -60,14 +60,14 @@ VERBS = {
     "demo": Verb("does the main job on the embedded sample", "avatar.pipeline.demo:demo", "DemoConfig"),
     "parameters": Verb(
         "counts every method's parameters",
-        "avatar.plain_verbs:parameters",
+        "avatar.cli:parameters",
         "avatar.pipeline.parameters:ParametersConfig",
     ),
-    "convert_body": Verb("converts an SMPL, SMPL-H or SMPL-X file", "avatar.plain_verbs:convert_body"),
-    "make_body": Verb("makes a body of any shape", "avatar.plain_verbs:make_body"),
-    "make_motion": Verb("writes one of the open dataset's motions as a file", "avatar.plain_verbs:make_motion"),
-    "pack": Verb("writes an outfit as packed frames, as POP's line stores them", "avatar.plain_verbs:pack"),
-    "doctor": Verb("lists what is installed and what is missing", "avatar.plain_verbs:doctor"),
+    "convert_body": Verb("converts an SMPL, SMPL-H or SMPL-X file", "avatar.cli:convert_body"),
+    "make_body": Verb("makes a body of any shape", "avatar.cli:make_body"),
+    "make_motion": Verb("writes one of the open dataset's motions as a file", "avatar.cli:make_motion"),
+    "pack": Verb("writes an outfit as packed frames, as POP's line stores them", "avatar.cli:pack"),
+    "doctor": Verb("lists what is installed and what is missing", "avatar.cli:doctor"),
 }
 
 OPTIONS = {  # that a verb's help begins with, a dozen at most

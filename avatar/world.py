@@ -54,18 +54,17 @@ def torchrun_world() -> Iterator[World]:
         yield World()
         return
     import torch
-    import torch.distributed as dist
 
     local, cuda = int(os.environ["LOCAL_RANK"]), torch.cuda.is_available()
     if cuda:
         if local >= torch.cuda.device_count():
             raise AvatarError(f"--nproc-per-node: expected at most {torch.cuda.device_count()} here (CUDA devices).")
         torch.cuda.set_device(local)
-    dist.init_process_group("cpu:gloo,cuda:nccl" if cuda else "gloo")
+    torch.distributed.init_process_group("cpu:gloo,cuda:nccl" if cuda else "gloo")
     try:
         yield current_world()
     finally:
-        dist.destroy_process_group()
+        torch.distributed.destroy_process_group()
 
 
 def require_single_process(what: str) -> None:
@@ -79,10 +78,9 @@ def average(tensors: list[Tensor], world: World) -> None:
     if world.size == 1:
         return
     import torch
-    import torch.distributed as dist
 
     flat = torch.cat([tensor.flatten() for tensor in tensors])
-    dist.all_reduce(flat)
+    torch.distributed.all_reduce(flat)
     flat /= world.size
     for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
         tensor.copy_(mean.view_as(tensor))

@@ -46,7 +46,6 @@ LAYERS = {
     "arguments": 8,
     "cli": 8,
     "__main__": 8,
-    "plain_verbs": 8,
 }
 SIBLINGS = 3  # the layer whose subpackages do not import each other
 FORBIDDEN = {("evaluation", "nn"), ("evaluation", "methods"), ("evaluation", "training")}

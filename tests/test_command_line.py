@@ -116,7 +116,7 @@ def test_a_python_without_packages_names_the_line_to_run(tool, tmp_path):
 
 
 def test_the_doctor_needs_no_package():
-    code = "import avatar.plain_verbs, avatar.environment; print(avatar.environment.install_hint('torch', ''))"
+    code = "import avatar.cli, avatar.environment; print(avatar.environment.install_hint('torch', ''))"
     line = [sys.executable, "-S", "-c", code]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=100, check=True)
     assert done.stdout.endswith(f"-m pip install -e {ROOT}\n")

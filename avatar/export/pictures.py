@@ -48,16 +48,13 @@ class Camera:
     center: tuple[float, float, float]  # in the middle of the picture, metres
     extent: float  # metres from its top to its bottom
     azimuth: float = 0.0  # degrees around the vertical, 0 before the person and 90 at the person's left
-    elevation: float = 0.0  # degrees above the horizon
     size: tuple[int, int] = (640, 960)  # pixels, width and height
 
     @property
     def axes(self) -> np.ndarray:
         """``(3, 3)`` rows right, up and towards the viewer, in the world."""
-        turn, lift = np.radians([self.azimuth, self.elevation])
-        towards = np.array([np.sin(turn) * np.cos(lift), np.sin(lift), np.cos(turn) * np.cos(lift)])
-        right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
-        return np.stack([right, np.cross(towards, right), towards])
+        turn = np.radians(self.azimuth)
+        return np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
 
     def seen_from(self, view: str) -> Camera:
         """The same framing from front, left, back, right, side (the left) or three_quarter."""
@@ -67,11 +64,7 @@ class Camera:
 
 
 def frame_camera(
-    points: np.ndarray,
-    view: str = "front",
-    size: tuple[int, int] = (640, 960),
-    margin: float = 0.05,
-    elevation: float = 0.0,
+    points: np.ndarray, view: str = "front", size: tuple[int, int] = (640, 960), margin: float = 0.05
 ) -> Camera:
     """A camera that shows all of ``points (..., 3)`` from a named view, with a margin as share of the picture.
 
@@ -83,11 +76,9 @@ def frame_camera(
     check_finite("points", cloud)
     center = (cloud.min(axis=0) + cloud.max(axis=0)) / 2
     around = np.hypot(*(cloud - center)[:, [0, 2]].T).max()
-    upwards = np.abs(cloud[:, 1] - center[1]).max()
-    lift = np.radians(elevation)
-    up = upwards * np.cos(lift) + around * np.abs(np.sin(lift))
+    up = np.abs(cloud[:, 1] - center[1]).max()
     extent = 2 * max(up, around * size[1] / size[0], 1e-3) / (1 - 2 * margin)
-    return Camera(tuple(center.tolist()), float(extent), 0.0, elevation, size).seen_from(view)
+    return Camera(tuple(center.tolist()), float(extent), size=size).seen_from(view)
 
 
 def shade(normals: np.ndarray, colors: str | tuple | np.ndarray, camera: Camera) -> np.ndarray:

@@ -14,7 +14,6 @@ from avatar.geometry.surface import vertex_normals
 from avatar.io.npz import write_whole
 from avatar.records import Motion
 
-FLOAT, UNSIGNED_INT, UNSIGNED_BYTE = 5126, 5125, 5121
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
 INFLUENCES = 4  # in one set of glTF attributes; some viewers read the first set only
 MAX_SETS = 2
@@ -57,7 +56,7 @@ class _Buffer:
     def add(self, values: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
         """Appends an array, one row an element, and returns its accessor's index."""
         kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-        components = {"float32": FLOAT, "uint32": UNSIGNED_INT, "uint8": UNSIGNED_BYTE}
+        components = {"float32": 5126, "uint32": 5125, "uint8": 5121}
         rows = np.ascontiguousarray(values).reshape(len(values), -1)
         raw = rows.astype(rows.dtype.newbyteorder("<")).tobytes()
         view = self.gltf.BufferView(buffer=0, byteOffset=len(self.data), byteLength=len(raw), target=target)

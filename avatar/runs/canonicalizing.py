@@ -54,9 +54,8 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     scans = LruSequence(lambda place: prepare(frames.frame(learned[place])), len(learned))
     torch.manual_seed(config.train.seed)
     model = Canonicalizer(template, len(scans), config.canonicalizer).to(choose_device(config.device))
-    trainer = Trainer(
-        canonicalizer.CanonicalizerTask(model, template, scans, names, config.train), config.train, config.folder
-    )
+    task = canonicalizer.CanonicalizerTask(model, template, scans, names, config.train)
+    trainer = Trainer(task, config.train, config.folder)
     trainer.fit()
     poses = torch.stack([scan.joint_transforms for scan in scans])
     facts = {"config": settings_to_dict(config), "frames": names, "steps": trainer.step, "seconds": trainer.seconds}

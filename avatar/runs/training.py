@@ -111,13 +111,8 @@ def load_avatar(folder: Path, checkpoint: str = "last", device: str = "auto") ->
     return TrainedAvatar(method, settings, model.to(choose_device(device)).eval(), template, config, steps, seconds)
 
 
-def choose_weights(
-    folder: Path, checkpoint: str, last: dict[str, Tensor], facts: dict[str, Any]
-) -> tuple[dict[str, Tensor], int, float]:
-    """Weights, steps and seconds of a run: the ``last``, which are given, or those of its ``best`` checkpoint.
-
-    Raises `DataError` for the best of a run that held no frames back.
-    """
+def choose_weights(folder: Path, checkpoint: str, last: dict, facts: dict) -> tuple[dict[str, Tensor], int, float]:
+    """Weights, steps and seconds of a run: the ``last``, which are given, or those of its ``best`` checkpoint."""
     if checkpoint == "last":
         return last, int(facts["steps"]), float(facts["seconds"])
     state = load_checkpoint(folder / "checkpoints", "best")
