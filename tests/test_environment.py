@@ -52,8 +52,8 @@ def test_a_missing_library_is_mended_by_its_package(message, line):
 
 def in_fresh_python(code: str, *arguments: str, **variables: str) -> subprocess.CompletedProcess:
     """A new interpreter's output, without what this one says about threads."""
-    told = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
-    kept = {name: value for name, value in os.environ.items() if name not in told}
+    preset = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+    kept = {name: value for name, value in os.environ.items() if name not in preset}
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],
         cwd=ROOT,
