@@ -116,7 +116,7 @@ def test_a_python_without_packages_names_the_line_to_run(tool, tmp_path):
 
 
 def test_the_doctor_needs_no_package():
-    code = "import avatar.plain_verbs, avatar.environment; print(avatar.environment.install_hint('torch', ''))"
+    code = "import avatar.cli, avatar.environment; print(avatar.environment.install_hint('torch', ''))"
     line = [sys.executable, "-S", "-c", code]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=100, check=True)
     assert done.stdout.endswith(f"-m pip install -e {ROOT}\n")
@@ -151,12 +151,12 @@ def test_lists_in_printed_commands_are_quoted():
 )
 def test_forms_that_are_not_options_are_explained(arguments, message):
     with pytest.raises(AvatarError) as caught:
-        tidy_arguments(arguments)
+        tidy_arguments(arguments, {})
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_flags_may_follow_options_and_lists_may_have_blanks():
-    assert tidy_arguments(["outfit=a,b", "-m", "runs=[a,", "b]"]) == ["-m", "outfit=a,b", "runs=[a, b]"]
+    assert tidy_arguments(["outfit=a,b", "-m", "runs=[a,", "b]"], {}) == ["-m", "outfit=a,b", "runs=[a, b]"]
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_a_mistyped_option_is_named_with_the_nearest_there_is(verb, override, me
     register(verb)
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"), pytest.raises(Exception) as caught:
         hydra.compose(verb, [override])
-    text = explain(caught.value, verb, [override], CONF)
+    text = explain(caught.value, verb, [override])
     assert message in text and "\n" not in text and "+" not in text and "_defaults" not in text
 
 

@@ -25,14 +25,13 @@ from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
-from avatar.invocation import command_line
+from avatar.invocation import command_line, option
 from avatar.io.checkpoints import building, read_weights
 from avatar.io.documents import read_yaml
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Stage, Task
 from avatar.methods.settings import CANONICALIZERS, Clock
 from avatar.records import Frame, LossTerms, Template, map_tensors
 from avatar.settings import settings_from_dict
-from avatar.values import option
 
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
 CHUNK = 20_000  # points queried at once, or fewer where memory runs out

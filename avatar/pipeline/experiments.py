@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from avatar.checks import AvatarError
-from avatar.data.outfits import SPLITS, VALIDATION
+from avatar.data.folders import SPLITS, VALIDATION
 from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.scores import read_scores, write_scores

@@ -12,7 +12,8 @@ import yaml
 
 from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.layouts import find_outfit
-from avatar.data.outfits import SPLITS, VALIDATION, Outfit
+from avatar.data.folders import SPLITS, VALIDATION
+from avatar.data.outfits import Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.environment import prepared_process
 from avatar.evaluation import aggregate, plots, tables

@@ -27,7 +27,7 @@ from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.settings import RunConfig
 from avatar.nn.decoders import Normals
-from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.prediction import predict_frames
 from avatar.runs.training import load_avatar
 
 MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
@@ -100,13 +100,11 @@ def predict(config: PredictConfig) -> list[Path]:
         name = motion.name if motion else config.split
         folders.append(predictions_folder(config.run, name, outfit.name))
         where = (folders[-1], meshes_folder(config.run, name, outfit.name), config.points, config.surface)
-        if motion is None:
-            predict_frames(avatar, outfit, config.split, *where)
-            continue
-        written = predict_motion(avatar, outfit, motion, *where)
-        for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
-            path.unlink()  # the end of an earlier prediction with more frames a second
-        write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
+        written = predict_frames(avatar, outfit, motion or config.split, *where)
+        if motion:
+            for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
+                path.unlink()  # the end of an earlier prediction with more frames a second
+            write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
     return folders
 
 

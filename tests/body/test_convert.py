@@ -21,8 +21,8 @@ from avatar.body.open import open_body
 from avatar.body.packed import packed_body, write_template
 from avatar.body.smpl import convert_body_model, joint_tree, smpl_body
 from avatar.checks import AvatarError, DataError
+from avatar.cli import convert_body
 from avatar.nn.atlas import Atlas
-from avatar.plain_verbs import convert_body
 
 PROTOCOLS = range(6)
 

@@ -20,7 +20,7 @@ from avatar.methods.closet import ClosetConfig
 from avatar.methods.points import body_batch, predict, template_samples
 from avatar.methods.registry import find_method
 from avatar.methods.settings import MethodChoice, Precision, RunConfig
-from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.prediction import predict_frames
 from avatar.runs.training import choose_weights, load_avatar, mean_template
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_from_dict
@@ -102,7 +102,7 @@ def test_a_run_comes_back_as_it_was_trained(settings, trained, tiny_outfit, tmp_
     best = load_avatar(trained, "best")
     assert best.steps in (130, 260)
     motion = authored_motion("walk", fps=10, seconds=0.5)
-    posed = predict_motion(avatar, tiny_outfit, motion, tmp_path / "m", tmp_path, 1000)
+    posed = predict_frames(avatar, tiny_outfit, motion, tmp_path / "m", tmp_path, 1000)
     assert len(posed) == len(motion.poses)
     assert np.ptp(read_points(posed[0]).points[:, 1]) > 1.2
 
