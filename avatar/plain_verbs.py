@@ -134,8 +134,8 @@ def pack() -> None:
     parser.add_argument("target", type=path, help="the folder to write")
     paths = parser.parse_args()
 
+    from avatar.data.folders import SPLITS
     from avatar.data.layouts import open_outfit_folder
-    from avatar.data.outfits import SPLITS
     from avatar.data.packed_layout import write_packed_outfit
 
     with refusals("pack"):

@@ -15,8 +15,9 @@ from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.body.packed import packed_body
 from avatar.body.registry import canonical_pose
 from avatar.checks import AvatarError, DataError
+from avatar.data.folders import outfit_folder, read_outfit_settings
 from avatar.data.fusion import fuse_mesh
-from avatar.data.outfits import Outfit, SurfaceOutfit, outfit_folder, read_outfit_settings
+from avatar.data.outfits import Outfit, SurfaceOutfit
 from avatar.data.packed_layout import PackedOutfit
 from avatar.data.scanner import DressedSurface, ScanConfig, paint, scan_mesh, scan_points
 from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_garment

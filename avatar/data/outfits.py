@@ -1,4 +1,4 @@
-"""One interface to an outfit on disk, whatever its layout, and finding it by name."""
+"""One interface to an outfit on disk, whatever its layout."""
 
 from __future__ import annotations
 
@@ -8,23 +8,18 @@ from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
 
 from avatar.body.model import BodyModel
-from avatar.checks import SAFE_NAME, AvatarError, DataError, check_name, did_you_mean, sentences
+from avatar.checks import AvatarError, DataError, did_you_mean, sentences
 from avatar.data.consistency import check_joints
+from avatar.data.folders import SPLITS, VALIDATION
 from avatar.data.validation import check_frame, check_pose, check_template
-from avatar.io.documents import read_yaml
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Scan, Template
-
-SPLITS = ("train", "test", "interpolation")  # interpolation: unseen poses of the kind that train has
-VALIDATION = "validation"  # training frames that a run held back: a split of `Outfit.with_validation`
-SAMPLE_FOLDER = Path(__file__).parents[1] / "assets" / "sample"
-OUTFIT_FORMAT = "outfit/1"
 
 
 class Outfit(ABC):
@@ -188,48 +183,3 @@ class SurfaceOutfit(Outfit):
     @abstractmethod
     def load_mesh(self, split: str, name: str) -> Scan:
         """What can be seen of a frame as a mesh: a scan with faces."""
-
-
-def read_outfit_settings(path: Path) -> dict[str, Any]:
-    """What an outfit's ``outfit.yaml`` says, or nothing where there is none.
-
-    Raises `DataError` for a file that is not a plain mapping, or of an unknown format.
-    """
-    file = Path(path) / "outfit.yaml"
-    if not file.is_file():
-        return {}
-    settings = read_yaml(file)
-    if settings.get("format", OUTFIT_FORMAT) != OUTFIT_FORMAT:
-        raise DataError(file, f"expected format {OUTFIT_FORMAT}, got {settings['format']}.", "Make the data again.")
-    return settings
-
-
-def outfit_folder(root: Path, dataset: str, outfit: str) -> Path:
-    """The folder of an outfit: ``<root>/<dataset>/<outfit>``, or the embedded one for the dataset ``sample``.
-
-    POP's nesting ``<root>/<dataset>/packed/<outfit>`` is found as well. Raises `AvatarError` for names that could leave
-    the data root; `DataError` for a data set or an outfit that is not there, naming those that are.
-    """
-    check_name("dataset", dataset)
-    check_name("outfit", outfit)
-    parent = SAMPLE_FOLDER if dataset == "sample" else Path(root) / dataset
-    if (parent / "packed").is_dir():
-        parent = parent / "packed"
-    if not parent.is_dir():
-        near = did_you_mean(dataset, ["sample", *(path.name for path in Path(root).glob("*/"))])
-        hint = f"Make it with tools/simulate.py, or put the data there as {parent}/<outfit>/train/*.npz."
-        raise DataError(parent, f"expected the folder of data set {dataset}, there is none.", sentences(near, hint))
-    there = outfit_names(parent)
-    if outfit not in there:
-        hint = sentences(did_you_mean(outfit, there), f"There are: {', '.join(there) or 'none'}.")
-        raise DataError(parent / outfit, "no such outfit.", hint)
-    folder = parent / outfit
-    if not folder.resolve().is_relative_to(parent.resolve()):
-        raise DataError(folder, f"expected a folder inside {parent}, it is a link to {folder.resolve()}.")
-    return folder
-
-
-def outfit_names(parent: Path) -> tuple[str, ...]:
-    """Names of the outfits in a data set's folder: those with a ``train`` or ``test`` folder, sorted."""
-    folders = (p for p in Path(parent).iterdir() if any((p / split).is_dir() for split in SPLITS))
-    return tuple(sorted(p.name for p in folders if SAFE_NAME.fullmatch(p.name)))

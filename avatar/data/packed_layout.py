@@ -17,7 +17,8 @@ from avatar.body.registry import body_of_file, canonical_name
 from avatar.body.skinning import blend_transforms, skin_transforms
 from avatar.checks import AvatarError, DataError, check_shape, require
 from avatar.data.consistency import check_posed, check_vertex_transforms
-from avatar.data.outfits import OUTFIT_FORMAT, SPLITS, Outfit, read_outfit_settings
+from avatar.data.folders import OUTFIT_FORMAT, SPLITS, read_outfit_settings
+from avatar.data.outfits import Outfit
 from avatar.data.validation import check_pose, check_size
 from avatar.geometry.transforms import invert_rigid, transform_points
 from avatar.io.atlases import read_obj_atlas

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar.checks import AvatarError
-from avatar.data.outfits import SPLITS, Outfit
+from avatar.data.folders import SPLITS
+from avatar.data.outfits import Outfit
 
 SEVERAL_SEQUENCES = 4  # from here on whole sequences are held back, below it frames
 

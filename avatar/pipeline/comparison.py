@@ -11,8 +11,9 @@ import numpy as np
 import yaml
 
 from avatar.checks import AvatarError, DataError, check_name
+from avatar.data.folders import SPLITS
 from avatar.data.layouts import find_outfit
-from avatar.data.outfits import SPLITS, Outfit
+from avatar.data.outfits import Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, by_split, method_key, named, order_methods

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from avatar.checks import AvatarError
-from avatar.data.outfits import SPLITS, VALIDATION
+from avatar.data.folders import SPLITS, VALIDATION
 from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, base_method, method_key
 from avatar.evaluation.scoring import ScoreConfig

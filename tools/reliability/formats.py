@@ -176,7 +176,7 @@ def copied(*parts: str) -> Callable[[Path], Path]:
     """Makes a copy of a file of the embedded sample, or of the program's assets."""
 
     def make(folder: Path) -> Path:
-        from avatar.data.outfits import SAMPLE_FOLDER
+        from avatar.data.folders import SAMPLE_FOLDER
 
         source = SAMPLE_FOLDER.joinpath(*parts)
         source = sorted(source.glob("*.npz"))[0] if source.is_dir() else source

@@ -12,7 +12,7 @@ import torch
 from avatar.canonical.canonicalizer import CanonicalizerConfig
 from avatar.canonical.fields import SkinningFieldConfig
 from avatar.canonical.posed import DrawConfig
-from avatar.data.outfits import SAMPLE_FOLDER
+from avatar.data.folders import SAMPLE_FOLDER
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
 from avatar.io.frames import write_manifest
