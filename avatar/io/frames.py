@@ -11,7 +11,7 @@ import numpy as np
 from avatar.checks import AvatarError, DataError, check_faces, check_finite, check_shape
 from avatar.io.documents import read_json
 from avatar.io.ledger import file_digest
-from avatar.io.npz import read_arrays, write_arrays, write_whole
+from avatar.io.npz import naming, read_arrays, write_described, write_whole
 
 QUANTUM = 5e-5  # metres: 0.05 mm
 FRAME_FORMAT, GARMENT_FORMAT, MANIFEST_FORMAT = "open-frame/1", "open-garment/1", "manifest/1"
@@ -54,20 +54,29 @@ class OpenGarment:
     names: tuple[str, ...]
 
 
+FRAME = {
+    "pose": "float J 3",
+    "translation": "float 3",
+    "origin": "float 3",
+    "cloth_high": "uint8 3 V",
+    "cloth_low": "uint8 3 V",
+    "face_counts": "int 2",
+    "visible_body": "uint8 B",
+    "visible_cloth": "uint8 C",
+    "penetration": "float 2",
+}
+HISTORY = {"history": "int "}
+GARMENT = {"faces": "int F 3", "canonical": "float V 3", "labels": "uint8 V", "names": "text G"}
+
+
 def write_open_frame(path: Path, frame: OpenFrame) -> None:
     """Writes a frame; cloth is rounded to 0.05 mm, everything else is exact.
 
-    Cloth is stored as steps from vertex to vertex in mesh order, high bytes apart from low bytes, because
-    both deflate well that way.
-
-    Raises:
-        AvatarError: on wrong shapes, non-finite numbers or cloth wider than 3.2 m.
+    Cloth is stored as steps from vertex to vertex in mesh order, high bytes apart from low bytes, because both deflate
+    well that way. Raises `AvatarError` on wrong shapes, non-finite numbers or cloth wider than 3.2 m.
     """
-    check_shape("pose", frame.pose, "J 3")
-    check_shape("translation", frame.translation, "3")
     check_shape("cloth", frame.cloth, "V 3")
-    for name in ("pose", "translation", "cloth"):
-        check_finite(name, getattr(frame, name))
+    check_finite("cloth", frame.cloth)
     cloth = np.asarray(frame.cloth, np.float64)
     origin = ((cloth.min(axis=0) + cloth.max(axis=0)) / 2).astype(np.float32)
     quanta = np.rint((cloth - origin) / QUANTUM)
@@ -75,44 +84,24 @@ def write_open_frame(path: Path, frame: OpenFrame) -> None:
         raise AvatarError(f"cloth: expected at most 3.2 m across, got {np.ptp(cloth, axis=0).max():.2f} m.")
     steps = np.diff(quanta.astype(np.int16).view(np.uint16), axis=0, prepend=np.uint16(0)).T
     folded = np.where(steps < 1 << 15, steps << 1, ~(steps << 1))  # small steps either way: small numbers
-    numbers = {
-        "format": np.array(FRAME_FORMAT),
-        "pose": np.asarray(frame.pose, np.float32),
-        "translation": np.asarray(frame.translation, np.float32),
+    values = {
+        "pose": frame.pose,
+        "translation": frame.translation,
         "origin": origin,
-        "cloth_high": (folded >> 8).astype(np.uint8),
-        "cloth_low": (folded & 255).astype(np.uint8),
-        "face_counts": np.array([len(frame.visible_body), len(frame.visible_cloth)], np.int32),
+        "cloth_high": folded >> 8,
+        "cloth_low": folded & 255,
+        "face_counts": [len(frame.visible_body), len(frame.visible_cloth)],
         "visible_body": np.packbits(np.asarray(frame.visible_body, bool)),
         "visible_cloth": np.packbits(np.asarray(frame.visible_cloth, bool)),
-        "penetration": np.array([frame.penetration_share, frame.penetration_depth], np.float32),
+        "penetration": [frame.penetration_share, frame.penetration_depth],
+        "history": frame.history or None,
     }
-    write_arrays(path, numbers | ({"history": np.array(frame.history, np.int32)} if frame.history else {}))
+    write_described(path, FRAME_FORMAT, FRAME | HISTORY, values)
 
 
 def read_open_frame(path: Path) -> OpenFrame:
-    """Reads a frame of the open dataset.
-
-    Raises:
-        DataError: when the file is missing, damaged, of another format or version.
-    """
-    stored = read_arrays(
-        path,
-        {
-            "pose": "float J 3",
-            "translation": "float 3",
-            "origin": "float 3",
-            "cloth_high": "uint8 3 V",
-            "cloth_low": "uint8 3 V",
-            "face_counts": "int 2",
-            "visible_body": "uint8 B",
-            "visible_cloth": "uint8 C",
-            "penetration": "float 2",
-        },
-        {"history": "int "},
-        limit=FRAME_BYTES,
-        version=FRAME_FORMAT,
-    )
+    """Reads a frame of the open dataset; `DataError` for a missing or damaged file, another format or version."""
+    stored = read_arrays(path, FRAME, HISTORY, FRAME_BYTES, FRAME_FORMAT)
     for key in ("origin", "translation"):
         if np.abs(stored[key]).max() > FARTHEST:
             raise DataError(path, f"{key}: expected metres within {FARTHEST:g} of the origin, got {stored[key]}.")
@@ -124,45 +113,33 @@ def read_open_frame(path: Path) -> OpenFrame:
         if (count + 7) // 8 != len(stored[key]):
             raise DataError(path, f"{key}: expected bits for {count} faces, got {len(stored[key])} bytes.")
         visible[key] = np.unpackbits(stored[key], count=count).astype(bool)
+    cloth = (quanta * QUANTUM + stored["origin"]).astype(np.float32)
+    share, depth = stored["penetration"].tolist()
+    history = int(stored.get("history", 0))
     return OpenFrame(
-        pose=stored["pose"],
-        translation=stored["translation"],
-        cloth=(quanta * QUANTUM + stored["origin"]).astype(np.float32),
-        penetration_share=float(stored["penetration"][0]),
-        penetration_depth=float(stored["penetration"][1]),
-        history=int(stored.get("history", 0)),
+        stored["pose"],
+        stored["translation"],
+        cloth,
         **visible,
+        penetration_share=share,
+        penetration_depth=depth,
+        history=history,
     )
 
 
 def write_open_garment(path: Path, garment: OpenGarment) -> None:
     """Writes an outfit's garment. Raises `AvatarError` on wrong shapes, face indices or labels."""
-    dims = check_shape("canonical", garment.canonical, "V 3")
-    check_shape("labels", garment.labels, "V", **dims)
-    check_finite("canonical", garment.canonical)
     _check_garment(garment)
-    write_arrays(
-        path,
-        {
-            "format": np.array(GARMENT_FORMAT),
-            "faces": np.asarray(garment.faces, np.int32),
-            "canonical": np.asarray(garment.canonical, np.float32),
-            "labels": np.asarray(garment.labels, np.uint8),
-            "names": np.array(garment.names, dtype=np.str_),
-        },
-    )
+    write_described(path, GARMENT_FORMAT, GARMENT, {key: getattr(garment, key) for key in GARMENT})
 
 
 def read_open_garment(path: Path) -> OpenGarment:
     """Reads an outfit's garment; faces come as int64. Raises `DataError` when the file is not valid."""
-    keys = {"faces": "int F 3", "canonical": "float V 3", "labels": "uint8 V", "names": "text G"}
-    stored = read_arrays(path, keys, limit=FRAME_BYTES, version=GARMENT_FORMAT)
-    names = tuple(str(name) for name in stored["names"])
-    garment = OpenGarment(stored["faces"].astype(np.int64), stored["canonical"], stored["labels"], names)
-    try:
+    stored = read_arrays(path, GARMENT, limit=FRAME_BYTES, version=GARMENT_FORMAT)
+    faces, names = stored["faces"].astype(np.int64), tuple(stored["names"].tolist())
+    garment = OpenGarment(faces, stored["canonical"], stored["labels"], names)
+    with naming(path):
         _check_garment(garment)
-    except AvatarError as error:
-        raise DataError(path, str(error)) from error
     return garment
 
 
@@ -184,8 +161,8 @@ def _listed_files(folder: Path) -> dict[str, Path]:
 def write_manifest(folder: Path) -> Path:
     """Records size and sha256 of a dataset folder's files in its ``manifest.json``; returns its path."""
     folder = Path(folder)
-    listed = _listed_files(folder)
-    files = {name: {"size": path.stat().st_size, "sha256": file_digest(path)} for name, path in listed.items()}
+    listed = _listed_files(folder).items()
+    files = {name: {"size": path.stat().st_size, "sha256": file_digest(path)} for name, path in listed}
     text = json.dumps({"format": MANIFEST_FORMAT, "files": files}, indent=1)
     write_whole(folder / MANIFEST, f"{text}\n".encode())
     return folder / MANIFEST
@@ -194,8 +171,7 @@ def write_manifest(folder: Path) -> Path:
 def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
     """Compares a dataset folder with its manifest: the same files of the same sizes, and hashes where asked.
 
-    Raises:
-        DataError: naming the file that is missing, changed or not in the manifest.
+    Raises `DataError` naming the file that is missing, changed or not in the manifest.
     """
     folder = Path(folder)
     path = folder / MANIFEST
@@ -207,14 +183,17 @@ def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
     if manifest.get("format") != MANIFEST_FORMAT:
         raise DataError(path, f"expected format {MANIFEST_FORMAT}, got {manifest.get('format')}.")
     files = _listed_files(folder)
-    for name in [*known, *(name for name in files if name not in known)]:
-        hint = "Make or download it again, or write the manifest anew if the change is meant."
+    for name in known | files:
+        size, digest = known.get(name, (0, ""))
         if name not in files:
-            raise DataError(folder / name, "the manifest lists it, it is not there.", hint)
-        if name not in known:
-            raise DataError(files[name], "it is not in the manifest.", hint)
-        size, digest = known[name]
-        if files[name].stat().st_size != size:
-            raise DataError(files[name], f"expected {size} bytes, got {files[name].stat().st_size}.", hint)
-        if verify_hashes and file_digest(files[name]) != digest:
-            raise DataError(files[name], "its sha256 is not the manifest's: the content has changed.", hint)
+            problem = "the manifest lists it, it is not there."
+        elif name not in known:
+            problem = "it is not in the manifest."
+        elif (found := files[name].stat().st_size) != size:
+            problem = f"expected {size} bytes, got {found}."
+        elif verify_hashes and file_digest(files[name]) != digest:
+            problem = "its sha256 is not the manifest's: the content has changed."
+        else:
+            continue
+        hint = "Make or download it again, or write the manifest anew if the change is meant."
+        raise DataError(folder / name, problem, hint)

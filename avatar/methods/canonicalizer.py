@@ -20,8 +20,7 @@ from avatar.canonical.posed import DrawConfig, PosedScan, ScanBatch, draw_batch,
 from avatar.canonical.scans import STRETCH
 from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.batches import FrameDataset, name_frames
-from avatar.data.canonical_frames import CanonicalOutfit
-from avatar.data.layouts import find_outfit
+from avatar.data.layouts import CanonicalOutfit, find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
