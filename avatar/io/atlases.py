@@ -26,20 +26,10 @@ class MeshAtlas:
 def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAtlas | None:
     """The UV atlas that an OBJ file has for a mesh of the same vertices, in any pose.
 
-    Its triangles or quads may stand in another order than the mesh's; a triangle of the mesh takes the coordinates of
-    the polygon that has its three vertices.
-
-    Args:
-        path: the OBJ file.
-        faces: ``(F, 3)`` of the mesh.
-        vertices: how many the mesh has.
-
-    Returns:
-        The atlas, or None for a file without texture coordinates.
-
-    Raises:
-        DataError: naming the file and what is wrong: missing, no OBJ, another mesh, polygons without coordinates,
-            coordinates out of [0, 1].
+    Its triangles or quads may stand in another order than the mesh's ``faces (F, 3)``; a triangle of the mesh takes the
+    coordinates of the polygon that has its three vertices. None for a file without texture coordinates. Raises
+    `DataError` naming the file and what is wrong: missing, no OBJ, another mesh, polygons without coordinates,
+    coordinates out of [0, 1].
     """
     path = Path(path)
     check_file(path, MAX_BYTES)
@@ -72,12 +62,11 @@ def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAt
 def _corner(word: str, vertices: int, places: int) -> tuple[int, int | None]:
     """Vertex and place in the atlas of a corner such as ``12/7/3`` or ``12``; negative numbers count from the last.
 
-    Raises:
-        ValueError: for what is no corner, or points to nothing.
+    Raises `ValueError` for what is no corner, or points to nothing.
     """
-    numbers = [int(number) if number else 0 for number in word.split("/")[:2]]
     found = []
-    for number, count in zip(numbers, (vertices, places)):
+    for digits, count in zip(word.split("/")[:2], (vertices, places)):
+        number = int(digits or 0)
         index = number - 1 if number > 0 else count + number
         if number and not 0 <= index < count:
             raise ValueError(f"corner {word} points to number {number} of {count}")
@@ -100,8 +89,7 @@ def _match(path: Path, polygons: list[list[tuple[int, int | None]]], faces: np.n
     bare = [number for number, places in enumerate(found) if None in places]
     if bare:
         hint = "Unwrap the whole body, and export the triangles or quads of its model as they are."
-        problem = (
-            f"{len(bare)} of the body's {len(faces)} triangles have no texture coordinates, the first is {bare[0]}"
-        )
-        raise DataError(path, f"{problem} (vertices {', '.join(map(str, faces[bare[0]]))}).", hint)
+        first = f"the first is {bare[0]} (vertices {', '.join(map(str, faces[bare[0]]))})."
+        problem = f"{len(bare)} of the body's {len(faces)} triangles have no texture coordinates, {first}"
+        raise DataError(path, problem, hint)
     return np.array(found, np.int64)

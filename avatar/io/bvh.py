@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -43,11 +44,7 @@ class _Joint:
 
 
 def read_bvh(path: Path) -> BvhMotion:
-    """Reads a BVH file.
-
-    Raises:
-        DataError: for a missing, oversized or damaged file, naming what was expected.
-    """
+    """Reads a BVH file; `DataError` for a missing, oversized or damaged one names what was expected."""
     path = Path(path)
     check_file(path, MAX_BYTES)
     try:
@@ -61,8 +58,8 @@ def read_bvh(path: Path) -> BvhMotion:
     except ValueError as error:
         raise DataError(path, f"expected a valid BVH file: {error}.") from error
     rotations, positions = _pose(joints, values)
-    names, parents = tuple(joint.name for joint in joints), tuple(joint.parent for joint in joints)
-    return BvhMotion(names, parents, np.array([joint.offset for joint in joints]), rotations, positions, fps)
+    names, parents, offsets = zip(*((joint.name, joint.parent, joint.offset) for joint in joints))
+    return BvhMotion(names, parents, np.array(offsets), rotations, positions, fps)
 
 
 def _read_hierarchy(tokens: list[str]) -> tuple[list[_Joint], int]:
@@ -74,14 +71,12 @@ def _read_hierarchy(tokens: list[str]) -> tuple[list[_Joint], int]:
     at = 1
     while True:
         token = tokens[at]
-        if token in ("ROOT", "JOINT"):
-            if len(joints) >= MAX_JOINTS or (token == "ROOT") != (not joints) or (stack and stack[-1] is None):
-                raise ValueError(f"{token} {tokens[at + 1]} stands where no joint can be")
-            joints.append(_Joint(tokens[at + 1], stack[-1] if stack else -1))
-            stack.append(len(joints) - 1)
-            at = _expect(tokens, at + 2, "{")
-        elif token == "End":
-            stack.append(None)
+        if token in ("ROOT", "JOINT", "End"):
+            if token != "End":
+                if len(joints) >= MAX_JOINTS or (token == "ROOT") != (not joints) or (stack and stack[-1] is None):
+                    raise ValueError(f"{token} {tokens[at + 1]} stands where no joint can be")
+                joints.append(_Joint(tokens[at + 1], stack[-1] if stack else -1))
+            stack.append(None if token == "End" else len(joints) - 1)
             at = _expect(tokens, at + 2, "{")
         elif token == "OFFSET":
             offset = [float(value) for value in tokens[at + 1 : at + 4]]
@@ -106,19 +101,20 @@ def _read_hierarchy(tokens: list[str]) -> tuple[list[_Joint], int]:
             raise ValueError(f"{token!r} stands where a joint, OFFSET, CHANNELS or }} was expected")
 
 
-def _expect(tokens: list[str], at: int, token: str) -> int:
-    """The place after an expected token."""
-    if tokens[at] != token:
-        raise ValueError(f"{tokens[at]!r} stands where {token!r} was expected")
-    return at + 1
+def _expect(tokens: list[str], at: int, *expected: str) -> int:
+    """The place after expected tokens."""
+    for token in expected:
+        if tokens[at] != token:
+            raise ValueError(f"{tokens[at]!r} stands where {token!r} was expected")
+        at += 1
+    return at
 
 
 def _read_frames(tokens: list[str], at: int, channels: int) -> tuple[np.ndarray, float]:
     """Channel values ``(T, channels)`` and frames per second."""
-    for token in ("MOTION", "Frames:"):
-        at = _expect(tokens, at, token)
+    at = _expect(tokens, at, "MOTION", "Frames:")
     frames = int(tokens[at])
-    at = _expect(tokens, _expect(tokens, at + 1, "Frame"), "Time:")
+    at = _expect(tokens, at + 1, "Frame", "Time:")
     seconds = float(tokens[at])
     values = np.array(tokens[at + 1 :], dtype=np.float64)
     if frames < 1 or channels < 3 or values.size != frames * channels:
@@ -137,16 +133,14 @@ def _pose(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndar
         own = values[:, column : column + len(joint.channels)]
         column += len(joint.channels)
         place = np.tile(np.array(joint.offset), (len(values), 1))
-        order, angles = "", []
-        for channel, value in zip(joint.channels, own.T):
-            if channel.endswith("position"):
+        turning = [channel.endswith("rotation") for channel in joint.channels]
+        for channel, turns, value in zip(joint.channels, turning, own.T):
+            if not turns:
                 place[:, "xyz".index(channel[0])] = value
-            else:
-                order += channel[0].upper()
-                angles.append(value)
         turn = np.tile(np.eye(3), (len(values), 1, 1))
-        if order:
-            turn = Rotation.from_euler(order, np.stack(angles, axis=-1), degrees=True).as_matrix()
+        if any(turning):
+            order = "".join(channel[0].upper() for channel in compress(joint.channels, turning))
+            turn = Rotation.from_euler(order, own[:, turning], degrees=True).as_matrix()
         if joint.parent < 0:
             rotations[:, index], positions[:, index] = turn, place
         else:

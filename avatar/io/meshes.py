@@ -23,7 +23,7 @@ from avatar.checks import (
     check_suffix,
     require,
 )
-from avatar.io.npz import write_whole
+from avatar.io.npz import naming, write_whole
 from avatar.records import Mesh
 
 FORMATS = (".ply", ".obj", ".glb", ".stl", ".off")
@@ -35,12 +35,9 @@ MAX_VERTICES = 20_000_000
 def write_mesh(path: str | Path, mesh: Mesh) -> None:
     """Writes a mesh in the format its file name ends in: PLY, OBJ, GLB, STL or OFF; metres, y up.
 
-    Vertices are float32. PLY and GLB keep the colours (8 bits a channel); STL keeps only the triangles. Equal
-    meshes give equal bytes, and the file appears whole or not at all.
-
-    Raises:
-        AvatarError: for a mesh that is not valid.
-        DataError: for another file name ending.
+    Vertices are float32. PLY and GLB keep the colours (8 bits a channel); STL keeps only the triangles. Equal meshes
+    give equal bytes, and the file appears whole or not at all. Raises `AvatarError` for a mesh that is not valid,
+    `DataError` for another file name ending.
     """
     path = Path(path)
     suffix = check_suffix(path, FORMATS, "a mesh file")
@@ -59,11 +56,9 @@ def read_mesh(path: str | Path) -> Mesh:
     """Reads a mesh: ``vertices (V, 3)`` float32, ``faces (F, 3)`` int64, and colours where PLY or GLB have them.
 
     Vertices keep their order. The triangle soup of an STL file is joined at equal positions; the parts of a GLB
-    scene become one mesh. Files a format refers to (materials, textures) are never opened.
-
-    Raises:
-        DataError: naming the file and what is wrong with it: missing, another format, damaged, too large, no
-            triangles, NaN, indices out of range or only triangles without area.
+    scene become one mesh. Files a format refers to (materials, textures) are never opened. Raises `DataError` naming
+    the file and what is wrong with it: missing, another format, damaged, too large, no triangles, NaN, indices out of
+    range or only triangles without area.
     """
     path = Path(path)
     suffix = check_suffix(path, FORMATS, "a mesh file")
@@ -86,20 +81,17 @@ def read_mesh(path: str | Path) -> Mesh:
     if suffix == ".stl" and len(vertices):
         vertices, joined = np.unique(vertices, axis=0, return_inverse=True)
         faces = joined.reshape(-1)[faces]
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is reported as not finite
-            mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int64), colors)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is reported as not finite
+        mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int64), colors)
+    with naming(path, prefix="holds no valid mesh: "):
         check_mesh(mesh)
-    except AvatarError as error:
-        raise DataError(path, f"holds no valid mesh: {error}") from error
     return mesh
 
 
 def check_mesh(mesh: Mesh) -> None:
     """Refuses a mesh that is empty, not finite, refers to vertices it lacks or has no triangle with area.
 
-    Raises:
-        AvatarError: naming the field and what is wrong.
+    Raises `AvatarError` naming the field and what is wrong.
     """
     dims = check_shape("vertices", mesh.vertices, "V 3")
     if dims["V"] > MAX_VERTICES:

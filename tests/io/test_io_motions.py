@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError, check_name
-from avatar.io.motions import read_body_motion, read_motion, resample_motion, write_motion
+from avatar.io.motions import move_body, read_body_motion, read_motion, resample_motion, write_motion
 from avatar.io.npz import write_arrays
-from avatar.io.retargeting import move_body
 from avatar.plain_verbs import make_motion
 from avatar.records import Motion, Template
 from avatar.simulate.sequences import authored_motion
