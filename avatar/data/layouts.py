@@ -15,7 +15,7 @@ from avatar.body.model import BodyModel
 from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.body.packed import packed_body
 from avatar.body.registry import canonical_pose
-from avatar.checks import AvatarError, DataError
+from avatar.checks import DataError
 from avatar.data.folders import outfit_folder, read_outfit_settings
 from avatar.data.fusion import fuse_mesh
 from avatar.data.outfits import Outfit, SurfaceOutfit
@@ -23,6 +23,7 @@ from avatar.data.packed_layout import PackedOutfit
 from avatar.data.scanner import DressedSurface, ScanConfig, paint, scan_mesh, scan_points
 from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_garment
+from avatar.io.npz import naming
 from avatar.records import BodyFit, Frame, Scan, Template
 
 
@@ -64,13 +65,9 @@ class OpenOutfit(SurfaceOutfit):
 
     def _make_body(self, shape: str) -> BodyModel:
         """An open body in the outfit's canonical pose."""
-        try:
+        with naming(self.path / "outfit.yaml", prefix="body: "):
             body = open_body(shape)
             return body.with_canonical_pose(canonical_pose(self._canonical, body.joint_names))
-        except DataError:
-            raise
-        except AvatarError as error:
-            raise DataError(self.path / "outfit.yaml", f"body: {error}") from error
 
     def _read_template(self) -> Template:
         return self.body.template
@@ -180,16 +177,10 @@ LAYOUTS = ("open", "packed")
 
 
 def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | None = None) -> Outfit:
-    """An outfit by the name of its data set and its own: the embedded ``sample``, ``open``, or packed data.
+    """An outfit by the names of its data set and its own below a data root (`outfit_folder`), of whatever layout.
 
-    Args:
-        root: the data root, with ``<dataset>/<outfit>`` below it.
-        dataset: ``sample`` is the one that comes with the program and needs no root.
-        outfit: the outfit's folder name.
-        scanner: how simulated frames are scanned; a perfect scanner if None. Real scans are as they are.
-
-    Raises `AvatarError` for names that could leave the data root; `DataError` naming the outfits there are, or what is
-    wrong with this one.
+    ``scanner`` is how simulated frames are scanned, perfectly if None; real scans are as they are. Raises `AvatarError`
+    for names that could leave the data root; `DataError` naming the outfits there are, or what is wrong with this one.
     """
     return open_outfit_folder(outfit_folder(root, dataset, outfit), dataset, scanner)
 

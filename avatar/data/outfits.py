@@ -15,7 +15,6 @@ import torch
 
 from avatar.body.model import BodyModel
 from avatar.checks import AvatarError, DataError, did_you_mean, sentences
-from avatar.data.consistency import check_joints
 from avatar.data.folders import SPLITS, VALIDATION
 from avatar.data.validation import check_frame, check_pose, check_template
 from avatar.io.ledger import digest_of, file_digest, files_digest
@@ -43,7 +42,6 @@ class Outfit(ABC):
         """
         template = self._read_template()
         check_template(template, self.path)
-        check_joints(template, self.path)
         return template
 
     def frames(self, split: str) -> tuple[str, ...]:
@@ -128,28 +126,20 @@ class Outfit(ABC):
     def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
         """The subject in any pose; what a pose encoder sees of it is in mean shape, with the root at rest.
 
-        Args:
-            pose: ``(J, 3)`` axis-angle, radians, relative to the parent and to the T-pose.
-            translation: ``(3,)`` metres; zero if None.
-
-        Raises `AvatarError` for a pose of other joints, or where the outfit has no body that can be posed.
+        ``pose (J, 3)`` axis-angle, radians, relative to the parent and to the T-pose; ``translation (3,)`` metres, zero
+        if None. Raises `AvatarError` for a pose of other joints, or where the outfit has no body that can be posed.
         """
         body = self.posable_body()
         check_pose(pose, len(body.parents))
-        translation = np.zeros(3, np.float32) if translation is None else np.asarray(translation, np.float32)
+        translation = np.asarray(np.zeros(3) if translation is None else translation, np.float32)
         pose = np.asarray(pose, np.float32)
         turned = torch.from_numpy(pose)[None]
         posed = body(turned, torch.from_numpy(translation)[None])
         rootless = turned.clone()
         rootless[:, 0] = body.canonical_pose[0]
-        return BodyFit(
-            vertices=posed.vertices[0].numpy(),
-            vertex_transforms=posed.vertex_transforms[0].numpy(),
-            joint_transforms=posed.joint_transforms[0].numpy(),
-            pose_vertices=self.mean_body(rootless).vertices[0].numpy(),
-            translation=translation,
-            pose=pose,
-        )
+        parts = {name: value[0].numpy() for name, value in vars(posed).items()}
+        seen = self.mean_body(rootless).vertices[0].numpy()
+        return BodyFit(**parts, pose_vertices=seen, translation=translation, pose=pose)
 
     @cached_property
     def _listed(self) -> dict[str, tuple[str, ...]]:

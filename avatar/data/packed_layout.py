@@ -15,17 +15,16 @@ from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.body.packed import write_body, write_template
 from avatar.body.registry import body_of_file, canonical_name
 from avatar.body.skinning import blend_transforms, skin_transforms
-from avatar.checks import AvatarError, DataError, check_shape, require
-from avatar.data.consistency import check_posed, check_vertex_transforms
+from avatar.checks import DataError, check_shape, require
 from avatar.data.folders import OUTFIT_FORMAT, SPLITS, read_outfit_settings
 from avatar.data.outfits import Outfit
-from avatar.data.validation import check_pose, check_size
+from avatar.data.validation import check_pose, check_posed, check_size, check_vertex_transforms
 from avatar.geometry.transforms import invert_rigid, transform_points
 from avatar.io.atlases import read_obj_atlas
 from avatar.io.frames import write_manifest
 from avatar.io.ledger import digest_of, file_digest
 from avatar.io.meshes import read_mesh
-from avatar.io.npz import read_arrays, write_arrays, write_whole
+from avatar.io.npz import naming, read_arrays, write_arrays, write_whole
 from avatar.io.points import color_bytes, unit_colors
 from avatar.records import BodyFit, Frame, Scan, Template
 
@@ -62,12 +61,10 @@ class PackedOutfit(Outfit):
 
     @cached_property
     def body(self) -> BodyModel | None:
-        """The body that ``outfit.yaml`` names or ``template.npz`` holds, or None where there is only a mesh."""
         return self._body_of(BODY)
 
     @cached_property
     def mean_body(self) -> BodyModel | None:
-        """The body that ``outfit.yaml`` names as ``mean_body`` or ``mean.npz`` holds; the person's own otherwise."""
         mean, own = self._body_of(MEAN), self.body
         if mean is None or own is None:
             return own
@@ -96,14 +93,9 @@ class PackedOutfit(Outfit):
         file = self._body_file(key)
         if file is None:
             return None
-        settings = dict(read_outfit_settings(self.path).get(key) or {})
-        settings.pop("path", None)
-        try:
-            return body_of_file(file, settings, f"{key}.")
-        except DataError:
-            raise
-        except AvatarError as error:
-            raise DataError(self.path / "outfit.yaml", str(error)) from error
+        settings = read_outfit_settings(self.path).get(key) or {}
+        with naming(self.path / "outfit.yaml"):
+            return body_of_file(file, {name: value for name, value in settings.items() if name != "path"}, f"{key}.")
 
     def _read_template(self) -> Template:
         return self.body.template if self.body else _template_of_mesh(self.path / "template.obj")
@@ -112,39 +104,15 @@ class PackedOutfit(Outfit):
         stored = read_arrays(path, REQUIRED, OPTIONAL)
         if self.body is None:
             stored = {key: value for key, value in stored.items() if key not in ("joint_transforms", "pose")}
-        count, joints = len(self.template.vertices), len(self.template.parents)
-        for key, expected in (
-            ("body_verts", count),
-            ("vtransf", count),
-            ("joint_transforms", joints),
-        ):
+        rows = dict.fromkeys(("body_verts", "vtransf"), len(self.template.vertices))
+        for key, expected in (rows | {"joint_transforms": len(self.template.parents)}).items():
             if key in stored and len(stored[key]) != expected:
-                hint = "The frame belongs to another body than the template."
-                raise DataError(
-                    path, f"{key}: expected {expected} rows as in the template, got {len(stored[key])}.", hint
-                )
+                problem = f"{key}: expected {expected} rows as in the template, got {len(stored[key])}."
+                raise DataError(path, problem, "The frame belongs to another body than the template.")
         if "pose" in stored:
             stored["pose"] = _stored_pose(stored["pose"], self.template.joint_names, path)
         stored = {k: v.astype(np.float32) if v.dtype.kind == "f" else v for k, v in stored.items()}
-        normals, colors = stored["scan_n"], stored.get("scan_colors")
-        scan = Scan(
-            points=stored["scan_pc"],
-            normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12),
-            faces=self._scan_faces(stored, path),
-            labels=stored.get("scan_labels"),
-            canonical=stored.get("scan_canonical"),
-            colors=None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu"),
-        )
-        return Frame(name, self.name, split, self._fit(stored, path), scan)
-
-    def _scan_faces(self, stored: dict[str, np.ndarray], path: Path) -> np.ndarray | None:
-        """Faces over the scan points, where the frame has them."""
-        faces = stored.get("scan_faces")
-        if faces is None:
-            return None
-        if faces.size and (faces.min() < 0 or faces.max() >= len(stored["scan_pc"])):
-            raise DataError(path, f"scan_faces: expected indices in [0, {len(stored['scan_pc'])}), got others.")
-        return faces.astype(np.int64)
+        return Frame(name, self.name, split, self._fit(stored, path), _stored_scan(stored, path))
 
     def _fit(self, stored: dict[str, np.ndarray], path: Path) -> BodyFit:
         """The body of a frame, with what the file lacks derived from what it has, and the rest of it compared."""
@@ -153,48 +121,37 @@ class PackedOutfit(Outfit):
             posed = self.fit_pose(stored["pose"], stored.get("translation"))
             if vertices is not None and "translation" not in stored:
                 posed = self.fit_pose(stored["pose"], (vertices - posed.vertices).mean(axis=0, dtype=np.float64))
-        joint_transforms = self._joint_transforms(stored, posed, path)
-        if "vtransf" in stored:
-            transforms = _whole_transforms(stored, path)
-        elif posed is not None:
-            transforms = posed.vertex_transforms
-        else:
-            transforms = self._skin(joint_transforms)
+        whole = _whole_transforms(stored, path) if "vtransf" in stored else None
+        joint_transforms = self._joint_transforms(stored, posed, whole, path)
+        joints, bound = torch.from_numpy(joint_transforms), template.canonical_from_bind
+        skinned = skin_transforms(template.weights, joints[None], bound)[0].numpy()
+        transforms = whole if whole is not None else skinned if posed is None else posed.vertex_transforms
         if vertices is None:
-            vertices = transform_points(torch.from_numpy(transforms), template.vertices).numpy()
-        self._compare(stored, posed, vertices, path)
+            vertices = _move(transforms, template)
+        check_size(vertices, template, path)
+        if posed is not None:
+            check_posed(posed.vertices, vertices, "pose", template, path)
+        if "joint_transforms" in stored:
+            check_posed(_move(skinned, template), vertices, "joint_transforms", template, path)
+        if whole is not None:
+            check_vertex_transforms(whole, template, vertices, path)
         pose_vertices = stored.get("pose_vertices")
         if pose_vertices is None and posed is not None and self.mean_body is not self.body:
             pose_vertices = posed.pose_vertices
         elif pose_vertices is None:
-            root = invert_rigid(torch.from_numpy(joint_transforms[0]))
-            pose_vertices = transform_points(root, torch.from_numpy(vertices)).numpy()
+            pose_vertices = transform_points(invert_rigid(joints[0]), torch.from_numpy(vertices)).numpy()
         return BodyFit(
             vertices=vertices,
-            vertex_transforms=_fit_translations(transforms, template.vertices.numpy(), vertices),
+            vertex_transforms=_fit_translations(transforms, template, vertices),
             joint_transforms=joint_transforms,
             pose_vertices=pose_vertices,
             translation=stored.get("translation", np.zeros(3, np.float32) if posed is None else posed.translation),
             pose=stored.get("pose"),
         )
 
-    def _compare(self, stored: dict[str, np.ndarray], posed: BodyFit | None, vertices: np.ndarray, path: Path) -> None:
-        """Refuses a frame whose body in metres, pose, joint transforms and ``vtransf`` contradict its vertices."""
-        check_size(vertices, self.template, path)
-        if posed is not None:
-            check_posed(posed.vertices, vertices, "pose", self.template, path)
-        if "joint_transforms" in stored:
-            skinned = transform_points(torch.from_numpy(self._skin(stored["joint_transforms"])), self.template.vertices)
-            check_posed(skinned.numpy(), vertices, "joint_transforms", self.template, path)
-        if "vtransf" in stored:
-            check_vertex_transforms(stored["vtransf"], self.template, vertices, path)
-
-    def _skin(self, joint_transforms: np.ndarray) -> np.ndarray:
-        """Vertex transforms ``(V, 4, 4)`` of joint transforms ``(J, 4, 4)``, both posed_from_canonical."""
-        joints, bound = torch.from_numpy(joint_transforms)[None], self.template.canonical_from_bind
-        return skin_transforms(self.template.weights, joints, bound)[0].numpy()
-
-    def _joint_transforms(self, stored: dict[str, np.ndarray], posed: BodyFit | None, path: Path) -> np.ndarray:
+    def _joint_transforms(
+        self, stored: dict[str, np.ndarray], posed: BodyFit | None, whole: np.ndarray | None, path: Path
+    ) -> np.ndarray:
         """Joint transforms ``(J, 4, 4)``: given, from the pose, or by least squares from vertex transforms.
 
         Skinning weights blend motions from the bind pose, so those are what is solved for.
@@ -208,27 +165,40 @@ class PackedOutfit(Outfit):
             return np.eye(4, dtype=np.float32)[None]
         if posed is not None:
             return posed.joint_transforms
-        if "vtransf" not in stored:
+        if whole is None:
             raise DataError(path, "expected vtransf, joint_transforms or pose to place the body, found none of them.")
-        template, transforms = self.template, _whole_transforms(stored, path)
-        whole = torch.from_numpy(_fit_translations(transforms, template.vertices.numpy(), stored.get("body_verts")))
-        bound = template.canonical_from_bind
-        from_bind = (whole @ blend_transforms(template.weights, bound[None])[0]).numpy()
+        template, bound = self.template, self.template.canonical_from_bind
+        exact = torch.from_numpy(_fit_translations(whole, template, stored.get("body_verts")))
+        from_bind = (exact @ blend_transforms(template.weights, bound[None])[0]).numpy()
         solved = fit_joint_transforms(from_bind, template.weights.numpy(), template.parents)
         return solved @ invert_rigid(bound).numpy()
+
+
+def _stored_scan(stored: dict[str, np.ndarray], path: Path) -> Scan:
+    """The scan of a frame, with unit normals."""
+    points, normals, faces, colors = (stored.get(f"scan_{key}") for key in ("pc", "n", "faces", "colors"))
+    if faces is not None and faces.size and (faces.min() < 0 or faces.max() >= len(points)):
+        raise DataError(path, f"scan_faces: expected indices in [0, {len(points)}), got others.")
+    return Scan(
+        points=points,
+        normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12),
+        faces=None if faces is None else faces.astype(np.int64),
+        labels=stored.get("scan_labels"),
+        canonical=stored.get("scan_canonical"),
+        colors=None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu"),
+    )
+
+
+def _move(transforms: np.ndarray, template: Template) -> np.ndarray:
+    """The template's vertices ``(V, 3)``, each moved by its transform ``(V, 4, 4)``."""
+    return transform_points(torch.from_numpy(transforms), template.vertices).numpy()
 
 
 def fit_joint_transforms(vertex_transforms: np.ndarray, weights: np.ndarray, parents: Sequence[int]) -> np.ndarray:
     """Rigid joint transforms whose blend by the skinning weights is nearest to given vertex transforms.
 
     Least squares over all vertices, then the nearest rotation to each joint's linear part. A joint that no vertex
-    follows moves with its parent.
-
-    Args:
-        vertex_transforms: ``(V, 4, 4)``; weights: ``(V, J)``; parents: J indices, parents before children.
-
-    Returns:
-        ``(J, 4, 4)`` float32.
+    follows moves with its parent. ``vertex_transforms (V, 4, 4)`` and ``weights (V, J)`` give ``(J, 4, 4)`` float32.
     """
     dims = check_shape("vertex_transforms", vertex_transforms, "V 4 4")
     check_shape("weights", weights, "V J", **dims)
@@ -260,12 +230,12 @@ def _whole_transforms(stored: dict[str, np.ndarray], path: Path) -> np.ndarray:
     return whole
 
 
-def _fit_translations(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None) -> np.ndarray:
-    """The transforms with translations that pose each rest vertex exactly, where it is known."""
+def _fit_translations(transforms: np.ndarray, template: Template, posed: np.ndarray | None) -> np.ndarray:
+    """The transforms with translations that pose each of the template's vertices exactly, where that is known."""
     if posed is None:
         return transforms
     exact = transforms.copy()
-    exact[:, :3, 3] = posed - np.einsum("vij,vj->vi", transforms[:, :3, :3], rest)
+    exact[:, :3, 3] = posed - np.einsum("vij,vj->vi", transforms[:, :3, :3], template.vertices.numpy())
     return exact
 
 
@@ -281,10 +251,8 @@ def _stored_pose(pose: np.ndarray, joint_names: Sequence[str], path: Path) -> np
             problem = f"pose: expected rotations of {joints} joints, it turns joints beyond them."
             raise DataError(path, problem, "Set body.all_joints: true in outfit.yaml to keep hands and face.")
         pose = np.concatenate([pose[:joints], np.zeros((max(joints - rows, 0), 3), pose.dtype)])
-    try:
+    with naming(path):
         check_pose(pose, joints)
-    except AvatarError as error:
-        raise DataError(path, str(error)) from error
     return pose
 
 
@@ -296,17 +264,15 @@ def _template_of_mesh(path: Path) -> Template:
         hint = f"Make one: python tools/convert_body.py <downloaded SMPL file> {target}"
         raise DataError(path.parent, problem, hint)
     mesh = read_mesh(path)
-    faces = np.asarray(mesh.faces, np.int64)
-    atlas = read_obj_atlas(path, faces, len(mesh.vertices))
+    atlas = read_obj_atlas(path, mesh.faces, len(mesh.vertices))
     return Template(
-        vertices=torch.from_numpy(np.asarray(mesh.vertices, np.float32)),
-        faces=torch.from_numpy(faces),
+        vertices=torch.from_numpy(mesh.vertices),
+        faces=torch.from_numpy(mesh.faces),
         weights=torch.ones(len(mesh.vertices), 1),
         joints=torch.zeros(1, 3),
         parents=(-1,),
         joint_names=("root",),
-        uv=None if atlas is None else torch.from_numpy(atlas.uv),
-        uv_faces=None if atlas is None else torch.from_numpy(atlas.uv_faces),
+        **({} if atlas is None else {key: torch.from_numpy(value) for key, value in vars(atlas).items()}),
     )
 
 
@@ -332,10 +298,7 @@ def write_packed_frame(path: Path, frame: Frame) -> None:
 
 
 def write_packed_outfit(outfit: Outfit, folder: Path) -> PackedOutfit:
-    """Writes all frames of an outfit, of whatever layout, as a packed outfit with template and manifest.
-
-    Raises `DataError` for an invalid frame.
-    """
+    """Writes all frames of an outfit as a packed outfit with template and manifest; `DataError` for an invalid one."""
     folder = Path(folder)
     settings = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{outfit.dataset}/{outfit.name}"}
     if outfit.body is None:
