@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
-from torch.utils.data import Dataset
 
 from avatar.checks import AvatarError
 from avatar.data.outfits import Outfit
@@ -78,7 +77,7 @@ def name_frames(outfits: Sequence[Outfit], split: str, names: Sequence[Sequence[
     return tuple(FrameName(i, split, name) for i, _ in enumerate(outfits) for name in names[i])
 
 
-class FrameDataset(Dataset):
+class FrameDataset:
     """Frames of one or more outfits of one body topology; `FrameName.outfit` points into them.
 
     Nothing here has a state that a resumed run would have to restore: the frames of an epoch come in the
@@ -103,14 +102,10 @@ class FrameDataset(Dataset):
                     f"outfits: expected one body topology in a run, {outfit.name} has another than {outfits[0].name}."
                 )
         self.outfits, self.names, self.points, self.seed = tuple(outfits), tuple(names), points, seed
-        self.epoch = 0  # the epoch that plain indexing draws scan points for
         self.frames = LruSequence(self._read, len(self.names), cache_bytes)
 
     def __len__(self) -> int:
         return len(self.names)
-
-    def __getitem__(self, index: int) -> Batch:
-        return self.item(self.epoch, index)
 
     def item(self, epoch: int, index: int) -> Batch:
         """A frame with its scan points for an epoch, float32, as a batch of one."""

@@ -14,16 +14,8 @@ import torch
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from avatar.data.scanner import (
-    DressedSurface,
-    ScanConfig,
-    facing_partners,
-    frame_seed,
-    keep_points,
-    outside_holes,
-    paint,
-    scan_mesh,
-)
+from avatar.data import scanner
+from avatar.data.scanner import DressedSurface, ScanConfig, keep_points
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.trees import build_tree
 from avatar.records import Scan
@@ -43,26 +35,20 @@ CHILDREN = {  # number of split edges: triangles over corners 0 1 2 and the midd
 def fuse_mesh(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan:
     """What can be seen of a dressed body as a raw mesh: edges of the scanner's fineness, contacts, noise, holes.
 
-    A vertex where two surfaces were joined keeps the truth of one of them, by lot. Depends on nothing but the
-    surface, the configuration and the frame's name.
-
-    Args:
-        surface: the dressed body.
-        config: longest edge, merging, noise, holes, pattern, seed; ``points`` does not matter.
-        frame: the frame's name, part of the random seed.
-
-    Raises `AvatarError` when nothing can be seen, or holes have taken every point.
+    A vertex where two surfaces were joined keeps the truth of one of them, by lot. Depends on nothing but the surface,
+    the configuration (``points`` does not matter) and the frame's name. Raises `AvatarError` when nothing can be seen,
+    or holes have taken every point.
     """
-    rng = np.random.default_rng(frame_seed(config.seed, frame))
-    scan = split_long_edges(scan_mesh(surface), config.edge)
+    rng = np.random.default_rng(scanner.frame_seed(config.seed, frame))
+    scan = split_long_edges(scanner.scan_mesh(surface), config.edge)
     if config.merge:
         scan = weld_contacts(scan, config.merge, rng)
     if config.noise:
         scan = replace(scan, points=scan.points + fused_noise(scan, config.noise, rng))
     if config.holes:
-        scan = keep_points(scan, outside_holes(scan.points, config.holes, config.hole_radius, rng))
+        scan = keep_points(scan, scanner.outside_holes(scan.points, config.holes, config.hole_radius, rng))
         scan = drop_small_components(scan)
-    return paint(replace(scan, normals=_face_normals(scan)), config.pattern)
+    return scanner.paint(replace(scan, normals=_face_normals(scan)), config.pattern)
 
 
 def split_long_edges(scan: Scan, longest: float) -> Scan:
@@ -111,12 +97,14 @@ def weld_contacts(scan: Scan, distance: float, rng: np.random.Generator) -> Scan
     boundary near another surface (a region hidden by an arm was never seen, a sleeve ends on skin), is joined: vertices
     and those they face become one in their middle, so that triangles of both surfaces share them.
     """
-    facing = facing_partners(scan.points, scan.normals, distance)
+    facing = scanner.facing_partners(scan.points, scan.normals, distance)
     inside = np.zeros(len(scan.points), bool)
     inside[np.concatenate(facing)] = True
     faces = scan.faces[~inside[scan.faces].all(axis=1)]
     borders = boundary_partners(scan, distance)
-    count, group = _join(np.concatenate([facing[0], borders[0]]), np.concatenate([facing[1], borders[1]]), len(inside))
+    pairs = np.concatenate([facing, borders], axis=1)  # vertices that become one
+    links = coo_matrix((np.ones(pairs.shape[1], bool), tuple(pairs)), shape=(len(inside),) * 2)
+    count, group = connected_components(links, directed=False)
     kept_of = np.empty(count, np.int64)  # whose truth a group keeps: the last one in a random order
     order = rng.permutation(len(inside))
     kept_of[group[order]] = order
@@ -124,23 +112,14 @@ def weld_contacts(scan: Scan, distance: float, rng: np.random.Generator) -> Scan
     middles = sums / np.bincount(group, minlength=count)[:, None]
     faces = group[faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    joined = Scan(
-        points=middles.astype(np.float32),
-        normals=scan.normals[kept_of],
-        faces=faces,
-        labels=scan.labels[kept_of],
-        canonical=scan.canonical[kept_of],
-    )
-    return drop_small_components(joined)
+    truth = {name: getattr(scan, name)[kept_of] for name in ("normals", "labels", "canonical")}
+    return drop_small_components(Scan(middles.astype(np.float32), faces=faces, **truth))
 
 
 def boundary_partners(scan: Scan, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices on open boundaries that come close to another surface, and the nearest vertex of that.
+    """Vertices ``(K,)`` on open boundaries that come close to another surface, and the nearest vertex of that.
 
     Another surface is another garment, the skin, or a part of the same that is far away at rest.
-
-    Returns:
-        Two index arrays ``(K,)``.
     """
     links = _links(scan)
     boundary = np.flatnonzero(np.abs(links - links.T).sum(axis=1))  # edges that no face runs along the other way
@@ -152,12 +131,6 @@ def boundary_partners(scan: Scan, distance: float) -> tuple[np.ndarray, np.ndarr
     other = known & (apart | (scan.labels[ids] != scan.labels[boundary, None]))
     near = other.any(axis=1)
     return boundary[near], ids[near, other[near].argmax(axis=1)]
-
-
-def _join(first: np.ndarray, second: np.ndarray, count: int) -> tuple[int, np.ndarray]:
-    """Number of groups of linked things, and the group of each ``(count,)``."""
-    links = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(count, count))
-    return connected_components(links, directed=False)
 
 
 def fused_noise(scan: Scan, noise: float, rng: np.random.Generator) -> np.ndarray:

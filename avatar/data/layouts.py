@@ -18,16 +18,15 @@ from avatar.body.registry import canonical_pose
 from avatar.checks import DataError
 from avatar.data.folders import outfit_folder, read_outfit_settings
 from avatar.data.fusion import fuse_mesh
-from avatar.data.outfits import Outfit, SurfaceOutfit
+from avatar.data.outfits import Outfit
 from avatar.data.packed_layout import PackedOutfit
 from avatar.data.scanner import DressedSurface, ScanConfig, paint, scan_mesh, scan_points
-from avatar.io.canonical_scans import read_canonical_scan
-from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_garment
+from avatar.io.frames import OpenFrame, OpenGarment, read_canonical_scan, read_open_frame, read_open_garment
 from avatar.io.npz import naming
 from avatar.records import BodyFit, Frame, Scan, Template
 
 
-class OpenOutfit(SurfaceOutfit):
+class OpenOutfit(Outfit):
     """An outfit of the open dataset: ``outfit.yaml``, ``garment.npz`` and frames of cloth and visibility."""
 
     def __init__(self, path: Path, dataset: str = "", scanner: ScanConfig | None = None):

@@ -18,14 +18,14 @@ from avatar.checks import AvatarError, DataError, did_you_mean, sentences
 from avatar.data.folders import SPLITS, VALIDATION
 from avatar.data.validation import check_frame, check_pose, check_template
 from avatar.io.ledger import digest_of, file_digest, files_digest
-from avatar.records import BodyFit, Frame, Scan, Template
+from avatar.records import BodyFit, Frame, Template
 
 
 class Outfit(ABC):
     """One person in one set of clothes: frames of scans with the body under them.
 
-    ``name``, ``dataset`` (the folder above), ``path``. `frames` and `load` are what training needs; `resample` is
-    there where the true surface is known.
+    ``name``, ``dataset`` (the folder above), ``path``. `frames` and `load` are what training needs; where the true
+    surface is known, ``resample`` and ``load_mesh`` are there as well (`OpenOutfit`).
     """
 
     def __init__(self, path: Path, dataset: str = ""):
@@ -161,15 +161,3 @@ class Outfit(ABC):
     @abstractmethod
     def _read_frame(self, path: Path, split: str, name: str) -> Frame:
         """One frame, from the layout's file."""
-
-
-class SurfaceOutfit(Outfit):
-    """An outfit whose true surface is known, so that it can be sampled at will."""
-
-    @abstractmethod
-    def resample(self, split: str, name: str, points: int, seed: int) -> Scan:
-        """A fresh, perfect sampling of a frame's true visible surface."""
-
-    @abstractmethod
-    def load_mesh(self, split: str, name: str) -> Scan:
-        """What can be seen of a frame as a mesh: a scan with faces."""

@@ -20,10 +20,9 @@ from avatar.data.folders import OUTFIT_FORMAT, SPLITS, read_outfit_settings
 from avatar.data.outfits import Outfit
 from avatar.data.validation import check_pose, check_posed, check_size, check_vertex_transforms
 from avatar.geometry.transforms import invert_rigid, transform_points
-from avatar.io.atlases import read_obj_atlas
 from avatar.io.frames import write_manifest
 from avatar.io.ledger import digest_of, file_digest
-from avatar.io.meshes import read_mesh
+from avatar.io.meshes import read_mesh, read_obj_atlas
 from avatar.io.npz import naming, read_arrays, write_arrays, write_whole
 from avatar.io.points import color_bytes, unit_colors
 from avatar.records import BodyFit, Frame, Scan, Template

@@ -51,44 +51,29 @@ def paint(scan: Scan, pattern: Pattern) -> Scan:
 
 
 def pattern_colors(pattern: Pattern, canonical: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Colours of points on skin and garments.
+    """Colours ``(M, 3)`` float32 RGB in [0, 1] of points on skin (label 0) and garments, each with its own two colours.
 
-    Args:
-        pattern: of all garments; each has its own two colours. Skin (label 0) has none.
-        canonical: ``(M, 3)`` places on the garments at rest, metres.
-        labels: ``(M,)`` which garment, 0 is skin.
-
-    Returns:
-        ``(M, 3)`` float32 RGB in [0, 1].
+    ``canonical (M, 3)`` are places on the garments at rest, metres; ``labels (M,)`` say which garment.
     """
     dims = check_shape("canonical", canonical, "M 3")
     check_shape("labels", labels, "M", **dims)
-    garment = (np.asarray(labels, np.int64) - 1) % len(PALETTES)
-    palettes = np.array(PALETTES)[garment]
-    ground, figure = palettes[:, 0], palettes[:, 1]
-    colors = np.where(_on_figure(pattern, canonical)[:, None], figure, ground)
-    if pattern is Pattern.flowers:
-        hearts = np.linalg.norm(_from_lattice(canonical), axis=1) < FLOWER_HEART
-        colors[hearts] = HEART
-    colors[np.asarray(labels) == 0] = SKIN
-    return colors.astype(np.float32)
-
-
-def _on_figure(pattern: Pattern, canonical: np.ndarray) -> np.ndarray:
-    """Which points ``(M,)`` have the figure's colour."""
-    if pattern is Pattern.none:
-        return np.zeros(len(canonical), bool)
-    if pattern is Pattern.stripes:
-        return np.floor(canonical[:, 1] / STRIPE) % 2 == 1
-    if pattern is Pattern.checks:
-        return np.floor(canonical / CHECK).sum(axis=1) % 2 == 1
     away = _from_lattice(canonical)
     distance = np.linalg.norm(away, axis=1)
-    if pattern is Pattern.dots:
-        return distance < DOT
     # petals along the axes: whichever way the cloth cuts through, it shows four of them
     petals = np.abs(away).max(axis=1) / np.maximum(distance, 1e-9)
-    return distance < FLOWER * petals**4
+    on_figure = {
+        Pattern.none: np.zeros(len(canonical), bool),
+        Pattern.stripes: np.floor(canonical[:, 1] / STRIPE) % 2 == 1,
+        Pattern.checks: np.floor(canonical / CHECK).sum(axis=1) % 2 == 1,
+        Pattern.dots: distance < DOT,
+        Pattern.flowers: distance < FLOWER * petals**4,
+    }
+    palettes = np.array(PALETTES)[(np.asarray(labels, np.int64) - 1) % len(PALETTES)]
+    colors = np.where(on_figure[pattern][:, None], palettes[:, 1], palettes[:, 0])
+    if pattern is Pattern.flowers:
+        colors[distance < FLOWER_HEART] = HEART
+    colors[np.asarray(labels) == 0] = SKIN
+    return colors.astype(np.float32)
 
 
 def _from_lattice(points: np.ndarray) -> np.ndarray:
@@ -154,15 +139,9 @@ class DressedSurface:
 def scan_points(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan:
     """Oriented points on what can be seen of a dressed body, spread evenly by area.
 
-    Normals are the smooth ones of the whole mesh, pointing out of body and cloth. Depends on nothing but the
-    surface, the configuration and the frame's name.
-
-    Args:
-        surface: the dressed body.
-        config: number of points, noise, holes, merging, pattern, seed.
-        frame: the frame's name, part of the random seed.
-
-    Raises `AvatarError` when nothing can be seen, or holes have taken every point.
+    Normals are the smooth ones of the whole mesh, pointing out of body and cloth. Depends on nothing but the surface,
+    the configuration and the frame's name. Raises `AvatarError` when nothing can be seen, or holes have taken every
+    point.
     """
     faces = surface.faces[surface.visible]
     if len(faces) == 0:
@@ -170,8 +149,7 @@ def scan_points(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan
     seed = frame_seed(config.seed, frame)
     samples = sample_surface(surface.vertices, faces, config.points, torch.Generator().manual_seed(seed))
     normals = interpolate(vertex_normals(surface.vertices, surface.faces), samples)
-    corner = samples.barycentric.argmax(dim=1, keepdim=True)
-    nearest_corner = samples.vertex_ids.gather(1, corner).squeeze(1)
+    nearest_corner = samples.vertex_ids.gather(1, samples.barycentric.argmax(dim=1, keepdim=True)).squeeze(1)
     scan = Scan(
         points=interpolate(surface.vertices, samples).numpy(),
         normals=torch.nn.functional.normalize(normals, dim=-1, eps=1e-20).numpy(),
@@ -182,8 +160,7 @@ def scan_points(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan
     if config.merge:
         scan = merge_contacts(scan, config.merge)
     if config.noise:
-        shaken = scan.points + config.noise * rng.standard_normal(scan.points.shape, np.float32)
-        scan = replace(scan, points=shaken)
+        scan = replace(scan, points=scan.points + config.noise * rng.standard_normal(scan.points.shape, np.float32))
     if config.holes:
         scan = keep_points(scan, outside_holes(scan.points, config.holes, config.hole_radius, rng))
     return paint(scan, config.pattern)
@@ -224,11 +201,7 @@ def merge_contacts(scan: Scan, distance: float) -> Scan:
 
 
 def facing_partners(points: np.ndarray, normals: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points that look at another surface across a gap narrower than ``distance``, and whom they look at.
-
-    Returns:
-        Two index arrays ``(K,)``: the points, and for each the nearest point ahead of it that faces it.
-    """
+    """Points ``(K,)`` that look at another surface nearer than ``distance``, and the nearest ahead that faces each."""
     pairs = build_tree(points).query_pairs(distance, output_type="ndarray")
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = pairs[np.einsum("kc,kc->k", normals[pairs[:, 0]], normals[pairs[:, 1]]) < FACING]
@@ -257,6 +230,5 @@ def keep_points(scan: Scan, kept: np.ndarray) -> Scan:
     names = ("points", "normals", "labels", "canonical", "colors")
     values = {name: getattr(scan, name)[kept] for name in names if getattr(scan, name) is not None}
     if scan.faces is not None:
-        renumbered = np.cumsum(kept) - 1
-        values["faces"] = renumbered[scan.faces[kept[scan.faces].all(axis=1)]]
+        values["faces"] = (np.cumsum(kept) - 1)[scan.faces[kept[scan.faces].all(axis=1)]]
     return replace(scan, **values)

@@ -1,4 +1,4 @@
-"""The open dataset's files: frames with cloth to 0.05 mm, garments, and the manifest of hashes."""
+"""Files of data sets: frames with cloth to 0.05 mm, garments, canonical scans, and the manifest of hashes."""
 
 from __future__ import annotations
 
@@ -12,12 +12,32 @@ from avatar.checks import AvatarError, DataError, check_faces, check_finite, che
 from avatar.io.documents import read_json
 from avatar.io.ledger import file_digest
 from avatar.io.npz import naming, read_arrays, write_described, write_whole
+from avatar.records import CanonicalScan
 
 QUANTUM = 5e-5  # metres: 0.05 mm
-FRAME_FORMAT, GARMENT_FORMAT, MANIFEST_FORMAT = "open-frame/1", "open-garment/1", "manifest/1"
+FRAME_FORMAT, GARMENT_FORMAT = "open-frame/1", "open-garment/1"
+SCAN_FORMAT, MANIFEST_FORMAT = "canonical-scan/1", "manifest/1"
 MANIFEST = "manifest.json"
 FARTHEST = 1000.0  # metres; the rounding of float32 is 0.06 mm there
 FRAME_BYTES = 64 << 20  # far above any frame; refuses a file that swells on unpacking
+FRAME = {
+    "pose": "float J 3",
+    "translation": "float 3",
+    "origin": "float 3",
+    "cloth_high": "uint8 3 V",
+    "cloth_low": "uint8 3 V",
+    "face_counts": "int 2",
+    "visible_body": "uint8 B",
+    "visible_cloth": "uint8 C",
+    "penetration": "float 2",
+}
+HISTORY = {"history": "int "}
+GARMENT = {"faces": "int F 3", "canonical": "float V 3", "labels": "uint8 V", "names": "text G"}
+SCAN = {"points": "float M 3", "normals": "float M 3", "weights": "uint16 J M", "source": "int M"}
+SCAN_EXTRAS = {"faces": "int F 3", "colors": "float M 3"}
+WEIGHT_STEPS = np.iinfo(np.uint16).max  # weights are stored in this many steps: 15 millionths each
+FAST = 1  # level of deflating: as small as level 9 but for 2%, in a tenth of the time
+UNIT_TOLERANCE = 1e-2  # of normals and of the sums of weights
 
 
 @dataclass(frozen=True)
@@ -52,21 +72,6 @@ class OpenGarment:
     canonical: np.ndarray
     labels: np.ndarray
     names: tuple[str, ...]
-
-
-FRAME = {
-    "pose": "float J 3",
-    "translation": "float 3",
-    "origin": "float 3",
-    "cloth_high": "uint8 3 V",
-    "cloth_low": "uint8 3 V",
-    "face_counts": "int 2",
-    "visible_body": "uint8 B",
-    "visible_cloth": "uint8 C",
-    "penetration": "float 2",
-}
-HISTORY = {"history": "int "}
-GARMENT = {"faces": "int F 3", "canonical": "float V 3", "labels": "uint8 V", "names": "text G"}
 
 
 def write_open_frame(path: Path, frame: OpenFrame) -> None:
@@ -149,6 +154,50 @@ def _check_garment(garment: OpenGarment) -> None:
     labels = np.asarray(garment.labels)
     if labels.min() < 1 or labels.max() > len(garment.names):
         raise AvatarError(f"labels: expected 1 to {len(garment.names)}, one number for each of {garment.names}.")
+
+
+def write_canonical_scan(path: str | Path, scan: CanonicalScan) -> None:
+    """Writes a canonical scan; weights are rounded to 1/65535, everything else is exact in float32.
+
+    Weights are stored joint by joint, which deflates four times faster than point by point. Raises `AvatarError` for
+    shapes that do not fit, non-finite numbers, normals that are not unit or indices out of range.
+    """
+    check_canonical_scan(scan)
+    weights = np.rint(np.asarray(scan.weights).T * WEIGHT_STEPS).astype(np.uint16)
+    values = vars(scan) | {"weights": weights}
+    described = SCAN | SCAN_EXTRAS
+    write_described(Path(path), SCAN_FORMAT, described, {key: values[key] for key in described}, FAST)
+
+
+def read_canonical_scan(path: str | Path) -> CanonicalScan:
+    """Reads a canonical scan; indices come as int64. Raises `DataError` naming the file and what is wrong with it."""
+    stored = read_arrays(path := Path(path), SCAN, SCAN_EXTRAS, version=SCAN_FORMAT)
+    weights = stored["weights"].T.astype(np.float32)
+    stored["weights"] = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1)
+    scan = CanonicalScan(**{key: a.astype(np.int64) if a.dtype.kind in "iu" else a for key, a in stored.items()})
+    with naming(path, "Canonicalize the scan again."):
+        check_canonical_scan(scan)
+    return scan
+
+
+def check_canonical_scan(scan: CanonicalScan) -> None:
+    """Refuses a canonical scan that is empty, not finite, or points at what it lacks; `AvatarError` names the field."""
+    dims = check_shape("points", scan.points, "M 3")
+    check_shape("normals", scan.normals, "M 3", **dims)
+    check_shape("weights", scan.weights, "M J", **dims)
+    check_shape("source", scan.source, "M", **dims)
+    if not dims["M"]:
+        raise AvatarError("points: expected at least one, got none.")
+    for name in ("points", "normals", "weights"):
+        check_finite(name, getattr(scan, name))
+    for name, lengths in (("normals", np.linalg.norm(scan.normals, axis=1)), ("weights", scan.weights.sum(axis=1))):
+        worst = float(lengths[np.abs(lengths - 1).argmax()])
+        if abs(worst - 1) > UNIT_TOLERANCE:
+            raise AvatarError(f"{name}: expected unit normals and rows of weights summing to 1, got {worst:.4g}.")
+    if scan.weights.min() < 0 or scan.source.min() < 0 or (np.diff(scan.source) <= 0).any():
+        raise AvatarError("weights, source: expected no negative weight and rising indices, got others.")
+    if scan.faces is not None:
+        check_faces(scan.faces, dims["M"])
 
 
 def _listed_files(folder: Path) -> dict[str, Path]:

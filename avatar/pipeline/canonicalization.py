@@ -27,7 +27,7 @@ from avatar.export.pictures import (
     render_points,
     save_picture,
 )
-from avatar.io.canonical_scans import read_canonical_scan
+from avatar.io.frames import read_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, module_digest
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole

@@ -13,8 +13,8 @@ from avatar.data.batches import CanonicalFrames, canonical_frame
 from avatar.data.splits import SplitConfig
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.implicit.losses import QueryConfig
-from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.checkpoints import load_checkpoint
+from avatar.io.frames import read_canonical_scan, write_canonical_scan
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
