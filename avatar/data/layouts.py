@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from avatar.body.model import BodyModel
 from avatar.body.open import MEAN_SHAPE, open_body
@@ -17,11 +15,10 @@ from avatar.body.packed import packed_body
 from avatar.body.registry import canonical_pose
 from avatar.checks import DataError
 from avatar.data.folders import outfit_folder, read_outfit_settings
-from avatar.data.fusion import fuse_mesh
 from avatar.data.outfits import Outfit
 from avatar.data.packed_layout import PackedOutfit
-from avatar.data.scanner import DressedSurface, ScanConfig, paint, scan_mesh, scan_points
-from avatar.io.frames import OpenFrame, OpenGarment, read_canonical_scan, read_open_frame, read_open_garment
+from avatar.data.scanner import DressedSurface, ScanConfig, fuse_mesh, paint, scan_mesh, scan_points
+from avatar.io.frames import OpenGarment, read_canonical_scan, read_open_frame, read_open_garment
 from avatar.io.npz import naming
 from avatar.records import BodyFit, Frame, Scan, Template
 
@@ -48,7 +45,6 @@ class OpenOutfit(Outfit):
 
     @cached_property
     def body(self) -> BodyModel:
-        """The subject."""
         if self._shape is not None:
             return self._make_body(self._shape)
         path = self.path / "body.npz"
@@ -72,9 +68,7 @@ class OpenOutfit(Outfit):
         return self.body.template
 
     def _read_frame(self, path: Path, split: str, name: str) -> Frame:
-        stored = self._read_open_frame(path)
-        body = self.fit_pose(stored.pose, stored.translation)
-        surface = self._surface(stored, body.vertices)
+        body, surface = self._dress(path)
         scan = fuse_mesh if self.scanner.mesh else scan_points
         return Frame(name, self.name, split, body, scan(surface, self.scanner, f"{self.name}/{name}"))
 
@@ -89,45 +83,35 @@ class OpenOutfit(Outfit):
 
     def load_body(self, split: str, name: str) -> BodyFit:
         """The body under a frame, without its scan."""
-        stored = self._read_open_frame(self.frame_path(split, name))
-        return self.fit_pose(stored.pose, stored.translation)
+        return self._dress(self.frame_path(split, name))[0]
 
     def load_surface(self, split: str, name: str) -> DressedSurface:
         """Body and cloth of a frame as one labelled mesh with its visible faces."""
-        stored = self._read_open_frame(self.frame_path(split, name))
-        return self._surface(stored, self.fit_pose(stored.pose, stored.translation).vertices)
+        return self._dress(self.frame_path(split, name))[1]
 
-    def _read_open_frame(self, path: Path) -> OpenFrame:
-        """A stored frame that fits the outfit's body and garment."""
-        stored = read_open_frame(path)
+    def _dress(self, path: Path) -> tuple[BodyFit, DressedSurface]:
+        """The posed body of a frame's file, and body and cloth as one mesh."""
+        stored, template, garment = read_open_frame(path), self.template, self.garment
         expected = {
             "pose": (len(self.body.parents), 3),
-            "cloth": self.garment.canonical.shape,
+            "cloth": garment.canonical.shape,
             "visible_body": (len(self.body.faces),),
-            "visible_cloth": (len(self.garment.faces),),
+            "visible_cloth": (len(garment.faces),),
         }
         for key, shape in expected.items():
             if getattr(stored, key).shape != shape:
                 problem = f"{key}: expected {shape} as body and garment.npz have it, got {getattr(stored, key).shape}."
                 raise DataError(path, problem, "Frame and garment are of different outfits.")
-        return stored
-
-    def _surface(self, stored: OpenFrame, body_vertices: np.ndarray) -> DressedSurface:
-        """Body and cloth as one mesh."""
-        template, garment = self.template, self.garment
-        skin = np.zeros(len(body_vertices), np.uint8)
-        return DressedSurface(
-            vertices=_stack([body_vertices, stored.cloth]),
-            canonical=_stack([template.vertices.numpy(), garment.canonical]),
-            faces=_stack([template.faces.numpy(), garment.faces + len(body_vertices)]),
-            visible=_stack([stored.visible_body, stored.visible_cloth]),
-            labels=_stack([skin, garment.labels]),
-        )
-
-
-def _stack(parts: Sequence[np.ndarray]) -> Tensor:
-    """Arrays one after the other, as a tensor."""
-    return torch.from_numpy(np.concatenate(parts))
+        body = self.fit_pose(stored.pose, stored.translation)
+        parts = {
+            "vertices": (body.vertices, stored.cloth),
+            "canonical": (template.vertices.numpy(), garment.canonical),
+            "faces": (template.faces.numpy(), garment.faces + len(body.vertices)),
+            "visible": (stored.visible_body, stored.visible_cloth),
+            "labels": (np.zeros(len(body.vertices), np.uint8), garment.labels),
+        }
+        surface = {name: torch.from_numpy(np.concatenate(pair)) for name, pair in parts.items()}
+        return body, DressedSurface(**surface)
 
 
 class CanonicalOutfit(Outfit):
@@ -144,16 +128,13 @@ class CanonicalOutfit(Outfit):
 
     @property
     def body(self) -> BodyModel | None:
-        """The subject's body."""
         return self.posed.body
 
     @property
     def mean_body(self) -> BodyModel | None:
-        """The body a pose encoder sees."""
         return self.posed.mean_body
 
     def frame_path(self, split: str, name: str) -> Path:
-        """The canonical scan of one of the outfit's frames. Raises `AvatarError` for a name that is not among them."""
         return self.scans / split / super().frame_path(split, name).name
 
     @cached_property

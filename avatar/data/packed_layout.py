@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +34,11 @@ log = logging.getLogger(__name__)
 BODY, MEAN = "body", "mean_body"  # keys of outfit.yaml
 BODY_FILES = {BODY: "template.npz", MEAN: "mean.npz"}  # where a body is that outfit.yaml gives no path
 
+# What a file and what a record calls the same
+BODY_KEYS = {"body_verts": "vertices", "vtransf": "vertex_transforms"}
+BODY_KEYS |= {key: key for key in ("joint_transforms", "pose", "translation", "pose_vertices")}
+SCAN_KEYS = {"scan_pc": "points", "scan_n": "normals"}
+SCAN_KEYS |= {f"scan_{key}": key for key in ("faces", "labels", "canonical", "colors")}
 REQUIRED = {"scan_pc": "float M 3", "scan_n": "float M 3"}
 OPTIONAL = {
     "body_verts": "float V 3",
@@ -74,27 +81,29 @@ class PackedOutfit(Outfit):
     @cached_property
     def shared_digest(self) -> str:
         """One hash over the files that the outfit's frames share, bodies elsewhere included."""
-        files = [self._body_file(key) for key in BODY_FILES]
-        return digest_of([super().shared_digest, *(file_digest(file) for file in files if file and file.is_file())])
+        files = [file for file, _ in self._bodies.values()]
+        return digest_of([super().shared_digest, *(file_digest(file) for file in files if file.is_file())])
 
-    def _body_file(self, key: str) -> Path | None:
-        """The file of one of the outfit's bodies; None where nothing speaks of it."""
-        file, said = self.path / BODY_FILES[key], read_outfit_settings(self.path).get(key)
-        if said is None:
-            return file if file.is_file() else None
-        if not isinstance(said, dict) or not isinstance(said.get("path", ""), str):
-            problem = f"{key}: expected a mapping such as {{path: {BODY_FILES[key]}, betas: []}}, got {said}."
-            raise DataError(self.path / "outfit.yaml", problem)
-        return self.path / said["path"] if "path" in said else file
+    @cached_property
+    def _bodies(self) -> dict[str, tuple[Path, dict[str, Any]]]:
+        """File and settings of the outfit's bodies by their keys, without those that nothing speaks of."""
+        found = {}
+        for key, default in BODY_FILES.items():
+            said = read_outfit_settings(self.path).get(key)
+            if said is not None and not (isinstance(said, dict) and isinstance(said.get("path", ""), str)):
+                problem = f"{key}: expected a mapping such as {{path: {default}, betas: []}}, got {said}."
+                raise DataError(self.path / "outfit.yaml", problem)
+            if said is not None or (self.path / default).is_file():
+                settings = dict(said or {})
+                found[key] = self.path / settings.pop("path", default), settings
+        return found
 
     def _body_of(self, key: str) -> BodyModel | None:
         """One of the outfit's bodies; None where nothing speaks of it."""
-        file = self._body_file(key)
-        if file is None:
+        if key not in self._bodies:
             return None
-        settings = read_outfit_settings(self.path).get(key) or {}
         with naming(self.path / "outfit.yaml"):
-            return body_of_file(file, {name: value for name, value in settings.items() if name != "path"}, f"{key}.")
+            return body_of_file(*self._bodies[key], f"{key}.")
 
     def _read_template(self) -> Template:
         return self.body.template if self.body else _template_of_mesh(self.path / "template.obj")
@@ -175,17 +184,14 @@ class PackedOutfit(Outfit):
 
 def _stored_scan(stored: dict[str, np.ndarray], path: Path) -> Scan:
     """The scan of a frame, with unit normals."""
-    points, normals, faces, colors = (stored.get(f"scan_{key}") for key in ("pc", "n", "faces", "colors"))
-    if faces is not None and faces.size and (faces.min() < 0 or faces.max() >= len(points)):
-        raise DataError(path, f"scan_faces: expected indices in [0, {len(points)}), got others.")
-    return Scan(
-        points=points,
-        normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12),
-        faces=None if faces is None else faces.astype(np.int64),
-        labels=stored.get("scan_labels"),
-        canonical=stored.get("scan_canonical"),
-        colors=None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu"),
-    )
+    scan = Scan(**{name: stored.get(key) for key, name in SCAN_KEYS.items()})
+    normals = scan.normals / np.maximum(np.linalg.norm(scan.normals, axis=1, keepdims=True), 1e-12)
+    faces, colors = scan.faces, scan.colors
+    if faces is not None and faces.size and (faces.min() < 0 or faces.max() >= len(scan.points)):
+        raise DataError(path, f"scan_faces: expected indices in [0, {len(scan.points)}), got others.")
+    faces = None if faces is None else faces.astype(np.int64)
+    colors = None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu")
+    return replace(scan, normals=normals, faces=faces, colors=colors)
 
 
 def _move(transforms: np.ndarray, template: Template) -> np.ndarray:
@@ -277,22 +283,11 @@ def _template_of_mesh(path: Path) -> Template:
 
 def write_packed_frame(path: Path, frame: Frame) -> None:
     """Writes a frame as a packed npz that this project and the readers of the POP line understand."""
-    body, scan = frame.body, frame.scan
-    arrays = {
-        "body_verts": body.vertices,
-        "vtransf": body.vertex_transforms,
-        "joint_transforms": body.joint_transforms,
-        "pose": body.pose,
-        "translation": body.translation,
-        "pose_vertices": body.pose_vertices,
-        "scan_pc": scan.points,
-        "scan_n": scan.normals,
-        "scan_faces": scan.faces,
-        "scan_labels": scan.labels,
-        "scan_canonical": scan.canonical,
-        "scan_colors": None if scan.colors is None else color_bytes(scan.colors),
-        "scan_name": np.array(frame.name),
-    }
+    arrays = {key: getattr(frame.body, name) for key, name in BODY_KEYS.items()}
+    arrays |= {key: getattr(frame.scan, name) for key, name in SCAN_KEYS.items()}
+    if frame.scan.colors is not None:
+        arrays["scan_colors"] = color_bytes(frame.scan.colors)
+    arrays["scan_name"] = np.array(frame.name)
     write_arrays(path, {key: value for key, value in arrays.items() if value is not None})
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +24,6 @@ SCALARS = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-
-
-@dataclass(frozen=True)
-class PlyHeader:
-    """What a PLY header promises: ``count`` vertices of ``properties`` (numpy codes by name), from byte ``start`` on.
-
-    ``byte_order`` is ``<``, ``>`` or empty for ASCII.
-    """
-
-    byte_order: str
-    count: int
-    properties: dict[str, str]
-    start: int
 
 
 def write_points(path: str | Path, cloud: PointCloud) -> None:
@@ -97,14 +83,17 @@ def read_points(path: str | Path) -> PointCloud:
     check_suffix(path, (".ply",), "a file name")
     check_file(path, MAX_BYTES)
     data = path.read_bytes()
-    header = read_ply_header(path, data)
-    missing = [name for name in COLUMNS if name not in header.properties]
+    row, count, rest, binary = _read_header(path, data)
+    missing = [name for name in COLUMNS if name not in row.names]
     if missing:
         problem = f"expected the vertex properties {' '.join(COLUMNS)}, {' '.join(missing)} missing."
         hint = "Estimate oriented normals first (MeshLab: Compute normals for point sets)."
         raise DataError(path, problem, hint)
-    colored = header.properties.keys() >= set(COLORS)
-    values = _read_columns(path, data, header, COLUMNS + COLORS if colored else COLUMNS)
+    if not count:
+        raise DataError(path, "expected at least one point, got an empty cloud.")
+    colored = set(COLORS) <= set(row.names)
+    read = _read_binary if binary else _read_ascii
+    values = read(path, rest, row, count, COLUMNS + COLORS if colored else COLUMNS)
     if not np.isfinite(values).all():
         bad = int((~np.isfinite(values)).any(axis=1).sum())
         raise DataError(path, f"{bad} of {len(values)} points are NaN or infinite.", "Remove them and try again.")
@@ -115,12 +104,15 @@ def read_points(path: str | Path) -> PointCloud:
         worst = float(lengths[off.argmax(), 0])
         raise DataError(path, f"expected unit normals, got one of length {worst:.4g}.", "Normalise them first.")
     normals = np.where(off > EXACT_LENGTH, normals / lengths, normals)
-    found = unit_colors(path, colors, header.properties["red"][0] in "iu") if colored else None
+    found = unit_colors(path, colors, row["red"].kind in "iu") if colored else None
     return PointCloud(points.astype(np.float32), normals.astype(np.float32), found)
 
 
-def read_ply_header(path: Path, data: bytes) -> PlyHeader:
-    """The vertex part of a PLY header, checked against the size of the file before anything is allocated."""
+def _read_header(path: Path, data: bytes) -> tuple[np.dtype, int, memoryview, bool]:
+    """What a PLY header promises: a vertex's properties, their number, the bytes after it, and whether they are binary.
+
+    The number is checked against the size of the file before anything is allocated.
+    """
     end = re.search(rb"end_header[ \t]*\r?\n", data[:MAX_HEADER])
     if not data.startswith(b"ply") or end is None:
         raise DataError(path, "expected a PLY file with a header, got something else.")
@@ -145,25 +137,25 @@ def read_ply_header(path: Path, data: bytes) -> PlyHeader:
         raise DataError(path, "the header names a vertex property twice.")
     if count > min(MAX_POINTS, len(data)):
         raise DataError(path, f"the header promises {count} vertices, more than the file or the limit can hold.")
-    return PlyHeader(byte_order, count, dict(properties), end.end())
+    row = np.dtype([(name, byte_order + code) for name, code in properties])
+    return row, count, memoryview(data)[end.end() :], bool(byte_order)
 
 
-def _read_columns(path: Path, data: bytes, header: PlyHeader, columns: tuple[str, ...]) -> np.ndarray:
-    """Some properties as ``(N, C)`` float64, from the lines of an ASCII file or the rows of a binary one."""
-    if not header.count:
-        raise DataError(path, "expected at least one point, got an empty cloud.")
-    promised = f"cut short: the header promises {header.count} vertices,"
-    if not header.byte_order:
-        lines = [line for line in data[header.start :].decode("latin-1").splitlines() if line.strip()][: header.count]
-        if len(lines) < header.count:
-            raise DataError(path, f"{promised} got {len(lines)} lines.")
-        places = [list(header.properties).index(name) for name in columns]
-        try:
-            return np.loadtxt(lines, usecols=places, ndmin=2, comments=None)
-        except ValueError as error:
-            raise DataError(path, f"a vertex line cannot be read ({error}).") from error
-    row = np.dtype([(name, header.byte_order + code) for name, code in header.properties.items()])
-    if header.start + header.count * row.itemsize > len(data):
-        raise DataError(path, f"{promised} the file holds {(len(data) - header.start) // row.itemsize}.")
-    rows = np.frombuffer(data, row, header.count, header.start)
+def _read_binary(path: Path, data: memoryview, row: np.dtype, count: int, columns: tuple[str, ...]) -> np.ndarray:
+    """Some properties as ``(N, C)`` float64, from the rows of a binary file."""
+    if count * row.itemsize > len(data):
+        held = len(data) // row.itemsize
+        raise DataError(path, f"cut short: the header promises {count} vertices, the file holds {held}.")
+    rows = np.frombuffer(data, row, count)
     return np.stack([rows[name].astype(np.float64) for name in columns], axis=1)
+
+
+def _read_ascii(path: Path, data: memoryview, row: np.dtype, count: int, columns: tuple[str, ...]) -> np.ndarray:
+    """The same from the lines of an ASCII file."""
+    lines = [line for line in str(data, "latin-1").splitlines() if line.strip()][:count]
+    if len(lines) < count:
+        raise DataError(path, f"cut short: the header promises {count} vertices, got {len(lines)} lines.")
+    try:
+        return np.loadtxt(lines, usecols=[row.names.index(name) for name in columns], ndmin=2, comments=None)
+    except ValueError as error:
+        raise DataError(path, f"a vertex line cannot be read ({error}).") from error
