@@ -30,10 +30,7 @@ Record = TypeVar("Record")
 
 
 class LruSequence(Sequence[Item]):
-    """A sequence of any length in bounded memory; the least recently used items leave first.
-
-    ``read`` gives an item, a dataclass of arrays or tensors, by its index; it must follow from the index alone, for it
-    may be read again.
+    """A sequence in bounded memory, of what ``read`` gives by index alone; the least recently used items leave first.
     """
 
     def __init__(self, read: Callable[[int], Item], count: int, max_bytes: int = MAX_BYTES):
@@ -80,10 +77,8 @@ def name_frames(outfits: Sequence[Outfit], split: str, names: Sequence[Sequence[
 class FrameDataset:
     """Frames of one or more outfits of one body topology; `FrameName.outfit` points into them.
 
-    Nothing here has a state that a resumed run would have to restore: the frames of an epoch come in the
-    permutation f(seed, epoch), the scan points of a frame are the subset f(seed, epoch, frame). A scan with fewer
-    ``points`` gives some of them more than once. Raises `AvatarError` without frames, or for bodies of several
-    topologies.
+    Stateless, so that runs resume: an epoch's frames come in the permutation f(seed, epoch), a frame's scan points are
+    the subset f(seed, epoch, frame), repeated where a scan has fewer. Raises `AvatarError` for several topologies.
     """
 
     def __init__(
@@ -164,10 +159,7 @@ def collate(parts: Sequence[Record]) -> Record:
 
 @dataclass(frozen=True)
 class CanonicalFrame:
-    """A canonical scan as points on its surface and the pose it was taken in; float32 tensors.
-
-    ``points``, ``normals (M, 3)``, ``colors (M, 3)`` or None, ``joint_transforms (J, 4, 4)`` posed_from_canonical.
-    """
+    """A canonical scan as points ``(M, 3)`` on its surface, and the pose it was taken in ``(J, 4, 4)``; float32."""
 
     name: str
     points: Tensor
@@ -208,8 +200,7 @@ class CanonicalBatch:
 class CanonicalFrames:
     """Canonical frames and the batches they make, as stateless as `FrameDataset`.
 
-    ``points`` are drawn of each frame, anew every epoch; a ``symmetry`` shows half of the frames in a mirror, with
-    another half every time. Raises `AvatarError` without frames.
+    A ``symmetry`` shows half of the frames in a mirror, with another half every time.
     """
 
     def __init__(self, frames: Sequence[CanonicalFrame], points: int, seed: int, symmetry: MirrorMap | None = None):
@@ -253,10 +244,7 @@ class MirrorMap:
 
 
 def mirror_map(template: Template) -> MirrorMap:
-    """The left-right symmetry of a template in a symmetric canonical pose.
-
-    Raises `AvatarError` when more than 1% of the vertices have no mirror image within 5 mm, or joints have no partner.
-    """
+    """The left-right symmetry of a template in a symmetric canonical pose; `AvatarError` where 1% of it has none."""
     mirrored = template.vertices * ACROSS.diagonal()[:3]
     ids = nearest(mirrored[None], template.vertices[None])[0]
     off = (template.vertices[ids] - mirrored).norm(dim=-1) > MIRROR_TOLERANCE

@@ -115,11 +115,10 @@ class OpenOutfit(Outfit):
 
 
 class CanonicalOutfit(Outfit):
-    """The frames of an outfit in its canonical space (SCANimate 3.1), for training there.
+    """The frames of an outfit in its canonical space (SCANimate 3.1); their scans are ``<scans>/<split>/<frame>.npz``.
 
-    A frame's scan is the canonical one and its body stands under it: the template's vertices, identity vertex
-    transforms. What tells the pose stays that of the posed frame: ``pose_vertices``, ``joint_transforms``, ``pose``.
-    The scans are ``<scans>/<split>/<frame>.npz``.
+    A frame's body stands at rest under its scan, with identity vertex transforms. What tells the pose stays that of the
+    posed frame: ``pose_vertices``, ``joint_transforms``, ``pose``.
     """
 
     def __init__(self, posed: Outfit, scans: Path):
@@ -157,19 +156,15 @@ LAYOUTS = ("open", "packed")
 
 
 def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | None = None) -> Outfit:
-    """An outfit by the names of its data set and its own below a data root (`outfit_folder`), of whatever layout.
+    """An outfit by the names of its data set and its own (`outfit_folder`); simulated frames are seen by a scanner.
 
-    ``scanner`` is how simulated frames are scanned, perfectly if None; real scans are as they are. Raises `AvatarError`
-    for names that could leave the data root; `DataError` naming the outfits there are, or what is wrong with this one.
+    Raises `AvatarError` for names that could leave the data root; `DataError` for what is not there, or invalid.
     """
     return open_outfit_folder(outfit_folder(root, dataset, outfit), dataset, scanner)
 
 
 def open_outfit_folder(path: Path, dataset: str = "", scanner: ScanConfig | None = None) -> Outfit:
-    """An outfit by its folder; the layout is what ``outfit.yaml`` says, or what its files show.
-
-    Raises `DataError` for an unknown layout, naming those there are.
-    """
+    """An outfit by its folder, of the layout that ``outfit.yaml`` says or its files show; `DataError` for another."""
     path = Path(path)
     shown = "open" if (path / "garment.npz").is_file() else "packed"
     layout = read_outfit_settings(path).get("layout", shown)

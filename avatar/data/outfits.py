@@ -24,8 +24,7 @@ from avatar.records import BodyFit, Frame, Template
 class Outfit(ABC):
     """One person in one set of clothes: frames of scans with the body under them.
 
-    ``name``, ``dataset`` (the folder above), ``path``. `frames` and `load` are what training needs; where the true
-    surface is known, ``resample`` and ``load_mesh`` are there as well (`OpenOutfit`).
+    Where the true surface is known, there are ``resample`` and ``load_mesh`` as well (`OpenOutfit`).
     """
 
     def __init__(self, path: Path, dataset: str = ""):
@@ -36,10 +35,7 @@ class Outfit(ABC):
 
     @cached_property
     def template(self) -> Template:
-        """The body at rest in its canonical pose, float32.
-
-        Raises `DataError` for a missing or damaged file, or a body that is not in metres or not at its joints.
-        """
+        """The body at rest in its canonical pose, float32, checked (`check_template`)."""
         template = self._read_template()
         check_template(template, self.path)
         return template
@@ -47,8 +43,8 @@ class Outfit(ABC):
     def frames(self, split: str) -> tuple[str, ...]:
         """Names of the frames of a split, sorted.
 
-        Raises `AvatarError` for a split that is not in `SPLITS`, nor validation where frames are held back; `DataError`
-        when the split's folder is missing or empty.
+        Raises `AvatarError` for an unknown split, or validation without frames held back; `DataError` for one without
+        frames.
         """
         if split == VALIDATION and self.held_back:
             return self.held_back
@@ -66,10 +62,7 @@ class Outfit(ABC):
         return bool(self._listed[split])
 
     def with_validation(self, names: Sequence[str]) -> Self:
-        """The same outfit with some of its training frames as a split of their own, ``validation``, as well.
-
-        Raises `AvatarError` for a frame that is not among those of training.
-        """
+        """The same outfit with some training frames as a split ``validation`` as well; `AvatarError` for others."""
         for name in names:
             self.frame_path("train", name)
         other = copy(self)
@@ -79,8 +72,7 @@ class Outfit(ABC):
     def load(self, split: str, name: str) -> Frame:
         """One frame, checked: finite, in metres, scan over body.
 
-        Raises `AvatarError` for a frame that is not in the split, naming near ones; `DataError` for a damaged or
-        invalid file.
+        Raises `AvatarError` for a frame that is not in the split, naming near ones; `DataError` for an invalid file.
         """
         path = self.frame_path(split, name)
         frame = self._read_frame(path, split, name)

@@ -57,12 +57,10 @@ OPTIONAL = {
 class PackedOutfit(Outfit):
     """Packed frames beside a body of the person who was scanned (docs/data.md has every key).
 
-    The body is what ``outfit.yaml`` names under ``body``, or ``template.npz``: a SMPL, SMPL-H or SMPL-X file converted
-    by ``tools/convert_body.py``, or a template of this project (`packed_body`). Then what a frame lacks is derived:
-    joint transforms from the pose, or from ``vtransf`` by least squares; ``vtransf`` from pose or joint transforms;
-    body vertices from any of them. Where several are there, they must agree. With ``template.obj`` alone nothing is
-    known of the joints, so frames must bring ``body_verts`` and ``vtransf``, and bodies must stand in their root frame
-    already, as those packed by POP do.
+    The body is what ``outfit.yaml`` names, or ``template.npz``. What a frame lacks is derived: joint transforms from
+    the pose, or from ``vtransf`` by least squares; ``vtransf`` from either; body vertices from any of them. What it has
+    must agree. With ``template.obj`` alone nothing is known of the joints: frames must bring ``body_verts`` and
+    ``vtransf``, in their root frame, as those packed by POP do.
     """
 
     @cached_property
@@ -200,10 +198,9 @@ def _move(transforms: np.ndarray, template: Template) -> np.ndarray:
 
 
 def fit_joint_transforms(vertex_transforms: np.ndarray, weights: np.ndarray, parents: Sequence[int]) -> np.ndarray:
-    """Rigid joint transforms whose blend by the skinning weights is nearest to given vertex transforms.
+    """Rigid joint transforms ``(J, 4, 4)`` float32 whose blend by ``weights (V, J)`` is nearest to ``(V, 4, 4)``.
 
-    Least squares over all vertices, then the nearest rotation to each joint's linear part. A joint that no vertex
-    follows moves with its parent. ``vertex_transforms (V, 4, 4)`` and ``weights (V, J)`` give ``(J, 4, 4)`` float32.
+    Least squares, then the nearest rotation; a joint that no vertex follows moves with its parent.
     """
     dims = check_shape("vertex_transforms", vertex_transforms, "V 4 4")
     check_shape("weights", weights, "V J", **dims)
@@ -222,11 +219,7 @@ def fit_joint_transforms(vertex_transforms: np.ndarray, weights: np.ndarray, par
 
 
 def _whole_transforms(stored: dict[str, np.ndarray], path: Path) -> np.ndarray:
-    """``vtransf`` as ``(V, 4, 4)``.
-
-    Packed files give the rotation block alone, or a translation that leaves out the subject's place in the world;
-    `_fit_translations` puts it right where the posed vertices are known.
-    """
+    """``vtransf`` as ``(V, 4, 4)``; files may lack translations, or leave out the subject's place in the world."""
     given = stored["vtransf"]
     if given.shape[-1] == 3 and "body_verts" not in stored:
         raise DataError(path, "expected body_verts, as vtransf has no translations.")
@@ -245,10 +238,9 @@ def _fit_translations(transforms: np.ndarray, template: Template, posed: np.ndar
 
 
 def _stored_pose(pose: np.ndarray, joint_names: Sequence[str], path: Path) -> np.ndarray:
-    """A file's pose as axis-angle of the body's joints ``(J, 3)``.
+    """A file's pose as axis-angle of the body's joints ``(J, 3)``; of hands and face either may lack some, at rest.
 
-    Joints of hands and face may be missing from the pose, or from the body: they are at rest then. Raises `DataError`
-    for another shape, or rotations of joints that the body lacks.
+    Raises `DataError` for another shape, or rotations of joints that the body lacks.
     """
     rows, joints, shared = len(pose) if pose.shape[1:] == (3,) else 0, len(joint_names), len(SMPL_JOINTS)
     if list(joint_names[:shared]) == SMPL_JOINTS and shared <= rows != joints:

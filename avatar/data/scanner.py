@@ -52,10 +52,7 @@ class Pattern(Enum):
 
 
 def paint(scan: Scan, pattern: Pattern) -> Scan:
-    """The scan with colours; as it is for `Pattern.none`.
-
-    Raises `AvatarError` for a scan without labels and canonical positions, which only simulated data has.
-    """
+    """The scan with colours, none for `Pattern.none`; `AvatarError` without labels and canonical positions."""
     if pattern is Pattern.none:
         return scan
     if scan.canonical is None or scan.labels is None:
@@ -133,10 +130,9 @@ SCANNERS = {
 
 @dataclass(frozen=True)
 class DressedSurface:
-    """Body and cloth of one frame as one mesh, and what can be seen of it.
+    """Body and cloth of one frame as one mesh: ``vertices (V, 3)`` posed, ``canonical (V, 3)`` at rest, float32.
 
-    ``vertices (V, 3)`` and ``canonical (V, 3)`` posed and at rest, float32 tensors; ``faces (F, 3)``; ``visible
-    (F,)`` bool; ``labels (V,)`` uint8, 0 skin, then one number a garment.
+    ``faces (F, 3)``, ``visible (F,)`` bool; ``labels (V,)`` uint8, 0 skin, then one number a garment.
     """
 
     vertices: Tensor
@@ -149,9 +145,8 @@ class DressedSurface:
 def scan_points(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan:
     """Oriented points on what can be seen of a dressed body, spread evenly by area.
 
-    Normals are the smooth ones of the whole mesh, pointing out of body and cloth. Depends on nothing but the surface,
-    the configuration and the frame's name. Raises `AvatarError` when nothing can be seen, or holes have taken every
-    point.
+    Normals are the smooth ones of the whole mesh. Follows from surface, configuration and the frame's name alone.
+    Raises `AvatarError` when nothing can be seen, or holes have taken every point.
     """
     faces = surface.faces[surface.visible]
     if len(faces) == 0:
@@ -196,10 +191,9 @@ def frame_seed(seed: int, frame: str) -> int:
 
 
 def merge_contacts(scan: Scan, distance: float) -> Scan:
-    """Runs surfaces that face each other across a narrow gap into one sheet, as a fused scan shows them.
+    """Runs surfaces that face each other closer than ``distance`` into one sheet, as a fused scan shows them.
 
-    A point whose nearest point on a surface facing it is closer than ``distance`` moves halfway to it, and its
-    normal turns to the blend of both. Truth (labels and canonical positions) stays.
+    Points move halfway to the other surface, normals turn to the blend of both; labels and canonical positions stay.
     """
     moving, partner = facing_partners(scan.points, scan.normals, distance)
     points, normals = scan.points.copy(), scan.normals.copy()
@@ -233,10 +227,7 @@ def outside_holes(points: np.ndarray, holes: int, radius: float, rng: np.random.
 
 
 def keep_points(scan: Scan, kept: np.ndarray) -> Scan:
-    """Some of a scan's points ``(M,)`` bool, in their order, with all that is known of them, and the faces over them.
-
-    A face goes with any of its corners.
-    """
+    """Some of a scan's points ``(M,)`` bool with all that is known of them, and the faces that keep all corners."""
     names = ("points", "normals", "labels", "canonical", "colors")
     values = {name: getattr(scan, name)[kept] for name in names if getattr(scan, name) is not None}
     if scan.faces is not None:
@@ -247,11 +238,9 @@ def keep_points(scan: Scan, kept: np.ndarray) -> Scan:
 def fuse_mesh(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan:
     """What can be seen of a dressed body as a raw mesh: edges of the scanner's fineness, contacts, noise, holes.
 
-    Where surfaces touch (an arm on the trunk, cloth on cloth) a real fused mesh is one sheet, which learned
-    canonicalization (SCANimate 3.1) has to cope with; the truth is kept beside every vertex.
-    A vertex where two surfaces were joined keeps the truth of one of them, by lot. Depends on nothing but the surface,
-    the configuration (``points`` does not matter) and the frame's name. Raises `AvatarError` when nothing can be seen,
-    or holes have taken every point.
+    Where surfaces touch, a real fused mesh is one sheet, which learned canonicalization (SCANimate 3.1) has to cope
+    with; its vertices keep the truth of one side, by lot. Follows from surface, configuration and name as
+    `scan_points`.
     """
     rng = np.random.default_rng(frame_seed(config.seed, frame))
     scan = split_long_edges(scan_mesh(surface), config.edge)
@@ -266,10 +255,9 @@ def fuse_mesh(surface: DressedSurface, config: ScanConfig, frame: str) -> Scan:
 
 
 def split_long_edges(scan: Scan, longest: float) -> Scan:
-    """The same surface with every edge at most so long: longer ones are halved until none is left.
+    """The same surface with every edge at most so long, halved until none is longer, without gaps.
 
-    Both triangles of an edge are split at its middle, so no gap opens. New vertices stand between their two, in truth
-    too, and have the label of the first.
+    New vertices stand between their two, in truth too, and have the label of the first.
     """
     values = np.concatenate([scan.points, scan.normals, scan.canonical], axis=1)
     labels, faces = scan.labels, scan.faces
@@ -307,9 +295,8 @@ def split_faces(faces: np.ndarray, middles: np.ndarray) -> np.ndarray:
 def weld_contacts(scan: Scan, distance: float, rng: np.random.Generator) -> Scan:
     """Joins surfaces closer than a distance into one sheet, as fusion does.
 
-    Where two surfaces face each other, the faces between them are dropped. What is left of them there, and every open
-    boundary near another surface (a region hidden by an arm was never seen, a sleeve ends on skin), is joined: vertices
-    and those they face become one in their middle, so that triangles of both surfaces share them.
+    Faces between surfaces that face each other are dropped; what is left there, and open boundaries near another
+    surface, is joined: vertices and those they face become one in their middle, so that triangles of both share them.
     """
     facing = facing_partners(scan.points, scan.normals, distance)
     inside = np.zeros(len(scan.points), bool)
@@ -331,7 +318,7 @@ def weld_contacts(scan: Scan, distance: float, rng: np.random.Generator) -> Scan
 
 
 def boundary_partners(scan: Scan, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices ``(K,)`` on open boundaries that come close to another surface, and the nearest vertex of that.
+    """Vertices ``(K,)`` on open boundaries near another surface, and the nearest vertex of that.
 
     Another surface is another garment, the skin, or a part of the same that is far away at rest.
     """

@@ -46,11 +46,10 @@ def split_outfit(outfit: Outfit, config: SplitConfig | None = None) -> Split:
 
 
 def split_frames(names: Sequence[str], config: SplitConfig) -> Split:
-    """Holds back validation frames, then thins the rest; depends on the names alone.
+    """Holds back validation frames, then thins the rest evenly; depends on the names alone.
 
-    Whole sequences (the name up to its last dot) are held back where there are four or more, because neighbouring
-    frames are nearly copies; otherwise the last stretch of frames is. The fraction keeps evenly spaced frames, and does
-    not change which frames validate. Raises `AvatarError` when there are too few frames to share.
+    Whole sequences are held back where there are four or more, because neighbouring frames are nearly copies, otherwise
+    the last frames. Raises `AvatarError` when there are too few frames to share.
     """
     names = sorted(names)
     count = max(round(len(names) * config.validation_share), 1) if config.validation_share > 0 else 0

@@ -51,9 +51,9 @@ TURNS = {  # where it should lie and where it does: what corrects it
 
 
 def check_template(template: Template, path: Path) -> None:
-    """Refuses a body at rest that does not stand upright in metres, y up, facing +z, with joints inside its limbs.
+    """Refuses a body at rest that does not stand upright in metres, y up, facing +z, with joints in its limbs.
 
-    Raises `DataError` with the turn, the factor or the largest gap that would correct it.
+    Raises `DataError` with the turn or the factor that would correct it.
     """
     extents = np.ptp(template.vertices.numpy(), axis=0)
     low, high = BODY_HEIGHT
@@ -87,11 +87,9 @@ def _axis_along(direction: np.ndarray) -> str:
 
 
 def check_joints(template: Template, path: Path) -> None:
-    """Refuses joints that do not lie where the skinning weights of their subtree end.
+    """Refuses joints that do not lie near the borders at which the skinning weights of their subtrees fade.
 
-    A joint turns its subtree about itself, so it lies near the border at which the subtree's weights fade
-    (`joint_positions`). Joints without such a border are not judged. Raises `DataError` with the largest gap and the
-    likely cause.
+    Joints without a border (`joint_positions`) are not judged. Raises `DataError` with the largest gap and its cause.
     """
     vertices = template.vertices.numpy()
     borders = border_positions(vertices, template.weights.numpy(), template.parents)
@@ -131,10 +129,7 @@ def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: 
 
 
 def check_frame(frame: Frame, template: Template, path: Path) -> None:
-    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out.
-
-    Raises `DataError` naming the file, what was expected and how to correct it.
-    """
+    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out."""
     scan, body, faces = frame.scan, frame.body.vertices, template.faces.numpy()
     if len(scan.points) < FEWEST_POINTS:
         problem = f"scan: expected at least {FEWEST_POINTS} points, got {len(scan.points)}."
@@ -176,11 +171,7 @@ def _unit_hint(size: float) -> str:
 
 @dataclass(frozen=True)
 class Overlap:
-    """How a scan lies over a body.
-
-    ``covered`` share of the body's skin with a scan point near, ``buried`` share of scan points deep under the skin,
-    ``outward`` share of scan normals that point the way the skin below them does.
-    """
+    """Shares: of skin with a scan point near, of scan deep under the skin, of scan normals that point as it does."""
 
     covered: float
     buried: float
@@ -306,9 +297,9 @@ def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> None:
 
 
 def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Template, path: Path) -> None:
-    """Refuses a frame's body ``vertices (V, 3)`` that is not where its ``what`` (pose, joint_transforms) puts it.
+    """Refuses ``vertices (V, 3)`` that ``posed (V, 3)``, the template posed by the frame's ``what``, does not meet.
 
-    ``posed (V, 3)`` is the template posed by it, metres. Raises `DataError` with the distance and the likely cause.
+    Raises `DataError` with the distance, metres, and the likely cause.
     """
 
     def distance(moved: np.ndarray) -> float:  # that all but a hundredth of the vertices keep
@@ -336,10 +327,9 @@ def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Te
 
 
 def check_vertex_transforms(transforms: np.ndarray, template: Template, vertices: np.ndarray, path: Path) -> None:
-    """Refuses ``vtransf (V, 3 or 4, 3 or 4)`` that does not turn the template's edges onto those of the posed body.
+    """Refuses ``vtransf (V, 4, 4)`` that does not turn the template's edges onto those of ``vertices (V, 3)``.
 
-    What it moves is not looked at. Raises `DataError` with the mean error in lengths of the edges of the frame's
-    ``vertices (V, 3)`` and the likely cause.
+    Raises `DataError` with the mean error in lengths of the edges and the likely cause.
     """
     linear = transforms[:, :3, :3].astype(np.float64)
     starts, ends = template.faces[:, :2].flatten().numpy(), template.faces[:, 1:].flatten().numpy()
@@ -373,10 +363,7 @@ def check_vertex_transforms(transforms: np.ndarray, template: Template, vertices
 
 
 def check_pose(pose: np.ndarray, joints: int) -> None:
-    """Refuses a pose that is not ``(J, 3)`` axis-angle in radians: matrices, quaternions, flat vectors, degrees.
-
-    Raises `AvatarError` with what it looks like and how to write it as expected.
-    """
+    """Refuses a pose that is not ``(J, 3)`` axis-angle in radians; `AvatarError` says what it looks like instead."""
     shape = tuple(np.shape(pose))
     if shape != (joints, 3):
         problem = f"pose: expected shape ({joints}, 3), axis-angle in radians, got {shape}."

@@ -20,10 +20,9 @@ CHANNELS = MOVES | {f"{axis}rotation" for axis in "xyz"}
 
 @dataclass(frozen=True)
 class BvhMotion:
-    """A BVH file, posed: J joints over T frames, parents before children, -1 for the root.
+    """A BVH file, posed: J joints over T frames, parents before children, -1 for the root, in the file's units.
 
-    ``offsets (J, 3)`` from the parent at rest; ``rotations (T, J, 3, 3)`` and ``positions (T, J, 3)`` in the world,
-    in the file's units; ``fps``.
+    ``offsets (J, 3)`` from the parent at rest; ``rotations (T, J, 3, 3)`` and ``positions (T, J, 3)`` in the world.
     """
 
     names: tuple[str, ...]

@@ -37,14 +37,11 @@ NAME = re.compile(r"step-(\d{8,})\.([0-9a-f]{16})\.pt")  # the step, and the fir
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float | None = None) -> Path:
-    """Writes the resume state of a step, keeps the last two and the best, and forgets older ones.
+    """Writes the resume state of a step, keeps the last two and the best (lowest score), and forgets older ones.
 
-    A file is on disk before the manifest names it, no file is ever written over, and the manifest is replaced whole:
-    a crash or a full disk at any moment leaves the checkpoints from before valid. One job at a time writes to the run's
-    ``checkpoints`` folder (`locks.lock_folder`). ``state`` is nested dicts and lists of tensors and plain values (it is
-    read back with ``weights_only``), ``best`` a validation score: the checkpoint with the lowest so far is kept.
-    Raises `AvatarError` when the state holds a number that is not finite (nothing is written then), `DataError` when
-    the disk refuses, saying how much room was needed and what there is still.
+    A file is on disk before the manifest names it, no file is ever written over, and the manifest is replaced whole: a
+    crash or a full disk at any moment leaves earlier checkpoints valid. Raises `AvatarError` for a number that is not
+    finite (nothing is written then), `DataError` when the disk refuses, saying how much room was needed.
     """
     _check_weights(named_tensors(state), f" at step {step}; this checkpoint")
     best = best if best is not None and math.isfinite(best) else None
@@ -98,10 +95,7 @@ def _check_weights(weights: Iterable[tuple[str, Tensor]], what: str) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The checkpoints a folder lists: ``last`` (oldest first) and ``best``; empty when there are none.
-
-    A damaged manifest is made again from the checkpoints, with a warning: their names hold step and hash.
-    """
+    """The checkpoints a folder lists, ``last`` (oldest first) and ``best``; made again from their names if damaged."""
     path = folder / MANIFEST
     if path.is_file():
         try:
@@ -186,19 +180,15 @@ class Budget(TorchFunctionMode):
 
 @contextmanager
 def building(path: Path, weights: Mapping[str, Tensor]) -> Iterator[None]:
-    """Builds and fills a network within a ``with`` block; sizes that its file invents are refused unallocated.
-
-    Raises `DataError` naming the file, when the settings ask for more than the weights hold, or the two do not fit.
-    """
+    """Builds and fills a network within a ``with`` block; `DataError` for sizes beyond those of its weights."""
     with restoring(path), Budget(FACTOR * sum(value.numel() for value in weights.values()) + SPARE):
         yield
 
 
 def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
-    """The resume state of the newest valid checkpoint (``last``) or of the best (``best``); None without any.
+    """The newest valid resume state (``last``) or the best (``best``); None without any.
 
-    A checkpoint whose bytes do not match its hash is passed over with a warning that names both files. Raises
-    `DataError` when checkpoints are listed and none of them is valid.
+    A damaged one is passed over with a warning. Raises `DataError` when those listed are all damaged.
     """
     entries = read_manifest(folder)
     listed = entries.get("last", [])[::-1] if which == "last" else [entries[key] for key in (which,) if key in entries]
@@ -213,10 +203,7 @@ def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
 
 
 def write_weights(path: Path, weights: dict[str, Tensor], description: dict[str, Any]) -> None:
-    """Writes weights to share: ``<path>.safetensors`` and ``<path>.json`` (description and sha256).
-
-    Raises `AvatarError` when a weight is not finite; nothing is written then.
-    """
+    """Writes ``<path>.safetensors`` and ``<path>.json`` (description, sha256); `AvatarError` if not finite."""
     _check_weights(weights.items(), f"; {path}.safetensors")
     data = save_tensors({name: value.contiguous().cpu() for name, value in weights.items()})
     described = description | {"sha256": hashlib.sha256(data).hexdigest()}

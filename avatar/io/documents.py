@@ -17,11 +17,10 @@ MAX_DEPTH = 50
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file that holds one mapping of plain values.
+    """A YAML file that holds one mapping of plain values; `DataError` for anything else, and for files too large.
 
-    Tags that make objects are refused by the safe loader; anchors, which let a kilobyte stand for a gigabyte, and
-    nesting deeper than 50 are refused here, before anything is built. Raises `DataError` for a missing, oversized or
-    damaged file, or one that holds anything else.
+    The safe loader refuses tags that make objects; anchors (a kilobyte may stand for a gigabyte) and deep nesting are
+    refused before anything is built.
     """
 
     def parse(text: str) -> Any:

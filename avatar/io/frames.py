@@ -42,12 +42,10 @@ UNIT_TOLERANCE = 1e-2  # of normals and of the sums of weights
 
 @dataclass(frozen=True)
 class OpenFrame:
-    """One simulated frame of the open dataset: the body's pose, the cloth, and which faces can be seen.
+    """One simulated frame: ``pose (J, 3)`` axis-angle, ``translation (3,)``, posed ``cloth (Vc, 3)``, visible faces.
 
-    ``pose (J, 3)`` axis-angle, radians; ``translation (3,)`` metres; ``cloth (Vc, 3)`` metres, posed;
-    ``visible_body (Fb,)`` and ``visible_cloth (Fc,)`` bool per face; ``penetration_share`` share of cloth
-    vertices inside the body, ``penetration_depth`` the deepest of them, metres; ``history`` how many frames were
-    simulated one after another before it: 0 where the cloth settled in this pose alone.
+    ``penetration_share`` of cloth vertices inside the body, ``penetration_depth`` of the deepest, metres; ``history``
+    counts the frames simulated before it, 0 where the cloth settled in this pose alone.
     """
 
     pose: np.ndarray
@@ -62,10 +60,8 @@ class OpenFrame:
 
 @dataclass(frozen=True)
 class OpenGarment:
-    """What all frames of an outfit share: the cloth's topology and its rest in the canonical pose.
-
-    ``faces (Fc, 3)``; ``canonical (Vc, 3)`` cloth settled in the canonical pose, metres; ``labels (Vc,)``
-    uint8, 1 for the first garment of ``names``.
+    """What all frames of an outfit share: ``faces (Fc, 3)``, ``canonical (Vc, 3)`` cloth at rest, metres, and
+    ``labels (Vc,)`` uint8, 1 for the first of ``names``.
     """
 
     faces: np.ndarray
@@ -75,10 +71,9 @@ class OpenGarment:
 
 
 def write_open_frame(path: Path, frame: OpenFrame) -> None:
-    """Writes a frame; cloth is rounded to 0.05 mm, everything else is exact.
+    """Writes a frame; cloth is rounded to 0.05 mm, as steps from vertex to vertex in mesh order, which deflate well.
 
-    Cloth is stored as steps from vertex to vertex in mesh order, high bytes apart from low bytes, because both deflate
-    well that way. Raises `AvatarError` on wrong shapes, non-finite numbers or cloth wider than 3.2 m.
+    Raises `AvatarError` on wrong shapes, non-finite numbers or cloth wider than 3.2 m.
     """
     check_shape("cloth", frame.cloth, "V 3")
     check_finite("cloth", frame.cloth)
@@ -157,10 +152,9 @@ def _check_garment(garment: OpenGarment) -> None:
 
 
 def write_canonical_scan(path: str | Path, scan: CanonicalScan) -> None:
-    """Writes a canonical scan; weights are rounded to 1/65535, everything else is exact in float32.
+    """Writes a canonical scan; weights are rounded to 1/65535, joint by joint, which deflates fast.
 
-    Weights are stored joint by joint, which deflates four times faster than point by point. Raises `AvatarError` for
-    shapes that do not fit, non-finite numbers, normals that are not unit or indices out of range.
+    Raises `AvatarError` as `check_canonical_scan` does.
     """
     check_canonical_scan(scan)
     weights = np.rint(np.asarray(scan.weights).T * WEIGHT_STEPS).astype(np.uint16)
@@ -218,10 +212,7 @@ def write_manifest(folder: Path) -> Path:
 
 
 def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
-    """Compares a dataset folder with its manifest: the same files of the same sizes, and hashes where asked.
-
-    Raises `DataError` naming the file that is missing, changed or not in the manifest.
-    """
+    """Compares a dataset folder with its manifest, with hashes where asked; `DataError` names the file that differs."""
     folder = Path(folder)
     path = folder / MANIFEST
     try:

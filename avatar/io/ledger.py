@@ -35,10 +35,8 @@ SOURCES = read_sources(PACKAGE)  # as the program began: a file edited while it 
 class Ledger:
     """The finished pieces of work in a folder, each by name and key, so that a command goes on where it stopped.
 
-    The key is a hash of everything a piece was made from. A piece counts as finished when its key is there and its
-    files still have the sha256 they were written with; a damaged, changed or missing one is to be done again. Pieces
-    of one name and several keys stand beside each other. Lines are only ever added, under a lock, each sealed with its
-    own hash: one that a killed process left half-written is passed over, and takes no other with it.
+    A key is a hash of everything a piece was made from; a piece is finished when its files still have the sha256 they
+    were written with. Lines are only added, under a lock, each with its own hash: a half-written one is passed over.
     """
 
     def __init__(self, folder: Path):
@@ -116,10 +114,7 @@ def file_digest(path: Path) -> str:
 
 
 def files_digest(folder: Path) -> str:
-    """One hash over the files that stand directly in a folder: what its frames share.
-
-    Hidden ones are left out, and the manifest, which lists the frames and so changes with each.
-    """
+    """One hash over the visible files directly in a folder but the manifest: what its frames share."""
     shared = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     paths = sorted(path for path in shared if path.name != "manifest.json")
     return digest_of({path.name: file_digest(path) for path in paths})

@@ -35,11 +35,10 @@ ROUNDING = 1e-5  # how far out of [0, 1] a texture coordinate may be written and
 
 
 def write_mesh(path: str | Path, mesh: Mesh) -> None:
-    """Writes a mesh in the format its file name ends in: PLY, OBJ, GLB, STL or OFF; metres, y up.
+    """Writes a mesh as PLY, OBJ, GLB, STL or OFF by its ending, whole or not at all; float32 metres, y up.
 
-    Vertices are float32. PLY and GLB keep the colours (8 bits a channel); STL keeps only the triangles. Equal meshes
-    give equal bytes, and the file appears whole or not at all. Raises `AvatarError` for a mesh that is not valid,
-    `DataError` for another file name ending.
+    PLY and GLB keep colours. Equal meshes give equal bytes. Raises `AvatarError` for an invalid mesh, `DataError` for
+    another ending.
     """
     path = Path(path)
     suffix = check_suffix(path, FORMATS, "a mesh file")
@@ -55,12 +54,10 @@ def write_mesh(path: str | Path, mesh: Mesh) -> None:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Reads a mesh: ``vertices (V, 3)`` float32, ``faces (F, 3)`` int64, and colours where PLY or GLB have them.
+    """Reads a mesh: ``vertices (V, 3)`` float32 in order, ``faces (F, 3)`` int64, colours where PLY or GLB have them.
 
-    Vertices keep their order. The triangle soup of an STL file is joined at equal positions; the parts of a GLB
-    scene become one mesh. Files a format refers to (materials, textures) are never opened. Raises `DataError` naming
-    the file and what is wrong with it: missing, another format, damaged, too large, no triangles, NaN, indices out of
-    range or only triangles without area.
+    STL vertices are joined at equal positions, the parts of a GLB become one; files it refers to are never opened.
+    Raises `DataError` naming the file and what is wrong with it.
     """
     path = Path(path)
     suffix = check_suffix(path, FORMATS, "a mesh file")
@@ -91,10 +88,7 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def check_mesh(mesh: Mesh) -> None:
-    """Refuses a mesh that is empty, not finite, refers to vertices it lacks or has no triangle with area.
-
-    Raises `AvatarError` naming the field and what is wrong.
-    """
+    """Refuses a mesh that is empty, not finite, refers to vertices it lacks or has no triangle with area."""
     dims = check_shape("vertices", mesh.vertices, "V 3")
     if dims["V"] > MAX_VERTICES:
         raise AvatarError(f"vertices: expected at most {MAX_VERTICES}, got {dims['V']}.")
@@ -132,12 +126,10 @@ class MeshAtlas:
 
 
 def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAtlas | None:
-    """The UV atlas that an OBJ file has for a mesh of the same vertices, in any pose.
+    """The UV atlas that an OBJ file has for a mesh of the same vertices, in any pose; None without coordinates.
 
-    Its triangles or quads may stand in another order than the mesh's ``faces (F, 3)``; a triangle of the mesh takes the
-    coordinates of the polygon that has its three vertices. None for a file without texture coordinates. Raises
-    `DataError` naming the file and what is wrong: missing, no OBJ, another mesh, polygons without coordinates,
-    coordinates out of [0, 1].
+    A triangle of ``faces (F, 3)`` takes the coordinates of the polygon that has its three vertices. Raises `DataError`
+    naming the file and what is wrong: another mesh, polygons without coordinates, coordinates out of [0, 1].
     """
     path = Path(path)
     check_file(path, ATLAS_BYTES)

@@ -62,9 +62,8 @@ CALIBRATION_FRAMES = 200
 def read_body_motion(path: Path, body: BodyModel, fps: float | None = None, up: str | None = None) -> Motion:
     """A motion file (`read_motion`) as poses of a body's own joints ``(T, J, 3)``.
 
-    BVH skeletons are fitted to the body's own proportions. AMASS translations are SMPL's ``trans`` and are given to the
-    body as they are, as are those of our own files. Raises `DataError` as `read_motion` does, `AvatarError` for a body
-    whose joints have names that are not known.
+    BVH skeletons are fitted to the body's proportions; translations of npz files (SMPL's ``trans``) are taken as they
+    are. Raises `AvatarError` for a body whose joints have unknown names.
     """
     return move_body(read_motion(path, fps, up, rest_joints(body)), body)
 
@@ -72,11 +71,9 @@ def read_body_motion(path: Path, body: BodyModel, fps: float | None = None, up: 
 def read_motion(path: Path, fps: float | None = None, up: str | None = None, rest: np.ndarray | None = None) -> Motion:
     """Reads a motion by its file's ending: ``.npz`` (AMASS SMPL, SMPL+H or SMPL-X, or our own) or ``.bvh``.
 
-    AMASS files are z-up and BVH files y-up unless ``up`` (y or z) says otherwise; all come out y-up, resampled to
-    ``fps`` where it is given. BVH skeletons are mapped by joint names (Mixamo, CMU, LAFAN) and fitted in size to a body
-    whose 22 joints lie at ``rest (22, 3)`` in the T-pose (the open body's if None), so their units do not matter.
-    Raises `DataError` for a missing or damaged file, one without a body's motion, or one whose people lie down because
-    its up axis is another; `AvatarError` for another ``up``, or a bad ``fps``.
+    AMASS files are z-up and BVH files y-up unless ``up`` says otherwise; all come out y-up, at ``fps`` if given. BVH
+    skeletons are mapped by joint names and fitted in size to T-pose joints ``rest (22, 3)`` (the open body's if None).
+    Raises `DataError` for an invalid file or people who lie down; `AvatarError` for a bad ``up`` or ``fps``.
     """
     path = Path(path)
     if up not in (None, "y", "z"):
@@ -100,8 +97,7 @@ def write_motion(path: Path, motion: Motion) -> None:
 def resample_motion(motion: Motion, fps: float) -> Motion:
     """A motion at another frame rate: rotations along the shortest arcs, translations along lines.
 
-    The first frame stays; the last is the last one that lies within the motion. Raises `AvatarError` for a frame rate
-    outside 1 to 1000.
+    The last frame is the last that lies within the motion. Raises `AvatarError` for a rate outside 1 to 1000.
     """
     low, high = FRAME_RATES
     if not low <= fps <= high:
@@ -191,11 +187,9 @@ def _check_upright(path: Path, bvh: BvhMotion, source: dict[int, int]) -> None:
 def retarget(bvh: BvhMotion, source: dict[int, int], name: str, rest: np.ndarray | None = None) -> Motion:
     """The motion of a y-up skeleton on our 22 joints, ``source`` of which it has (`map_joints`).
 
-    Joint rotations in the world are kept, after the difference between the skeleton's rest and the T-pose is taken off.
-    Where the rest is nothing like a T-pose (LAFAN), that difference is what on average lies between the file's
-    rotations and the shortest turns that point our bones along the file's. Joints the skeleton lacks move with their
-    parents. Translations are scaled by the ratio of leg lengths, so the file's units do not matter. ``rest (22, 3)`` is
-    as in `read_motion`.
+    Rotations in the world are kept but for the difference between its rest and the T-pose; where its rest is nothing
+    like one (LAFAN), but for the mean between them and the shortest turns of our bones along its own. Joints it lacks
+    move with their parents. Translations are scaled by leg lengths, so units do not matter.
     """
     rest = open_body(MEAN_SHAPE).template.joints.double().numpy() if rest is None else rest
     offsets = np.zeros_like(bvh.offsets)  # joint positions at rest, the root at the origin
@@ -215,9 +209,8 @@ def retarget(bvh: BvhMotion, source: dict[int, int], name: str, rest: np.ndarray
 def move_body(motion: Motion, body: BodyModel) -> Motion:
     """A motion of our 22 joints as one of a body with other joints, of other names or in another order.
 
-    A joint takes the world rotation of the joint of ours that it is named like (`map_joints`), as both are zero in the
-    T-pose; joints like none of ours (fingers, face) stay at rest relative to their parents. Raises `AvatarError` for a
-    body whose names are not known.
+    A joint takes the world rotation of ours that it is named like (`map_joints`); others (fingers, face) stay at rest
+    relative to their parents. Raises `AvatarError` for a body whose names are not known.
     """
     if body.joint_names == tuple(SMPL_JOINTS) and body.parents == SMPL_PARENTS:
         return motion
@@ -238,10 +231,9 @@ def rest_joints(body: BodyModel) -> np.ndarray:
 
 
 def map_joints(names: Sequence[str], parents: Sequence[int]) -> dict[int, int]:
-    """Our joint index to a skeleton's, by SMPL's names or other common ones.
+    """Our joint index to a skeleton's, by SMPL's names or other common ones; `AvatarError` names those not found.
 
-    The joints between hips and neck are shared over the spine. Raises `AvatarError` naming the joints of ours that were
-    not found.
+    The joints between hips and neck are shared over the spine.
     """
     exact = {INDEX[name]: index for index, name in enumerate(names) if name in INDEX}
     if all(INDEX[joint] in exact for joint in NEEDED):
@@ -287,10 +279,9 @@ def _mapped_parent(joint: int, source: dict[int, int]) -> int:
 
 
 def _aligned_rest(source: dict[int, int], rest: np.ndarray, offsets: np.ndarray) -> dict[int, np.ndarray] | None:
-    """Rotations ``(3, 3)`` from our T-pose to the skeleton's rest, or None where that is nothing like a T-pose.
+    """Rotations ``(3, 3)`` from our T-pose to the skeleton's rest, None where that is nothing like one.
 
-    All joints turn to where the skeleton faces. Limbs turn further onto its arms and legs, and hands with them;
-    other bones do not, because where trunk and feet have their joints differs more than how they are held.
+    All joints turn to where it faces, limbs and hands onto its own; where trunk and feet have joints says too little.
     """
     left, right = (offsets[source[INDEX[f"{side}_hip"]]] for side in ("left", "right"))
     across = left - right

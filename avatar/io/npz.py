@@ -47,12 +47,10 @@ def read_arrays(
 ) -> dict[str, np.ndarray]:
     """Reads named arrays of an npz file; other keys are never decoded, so what they hold does not matter.
 
-    A key is described by its kind and its shape, as in ``"float V 3"`` or ``"float V 3 3 | V 4 4"``: kinds are float,
-    int, bool, text, number, or an exact dtype such as uint8; a named size must be the same wherever it stands.
-    ``limit`` is the bytes that all arrays may take unpacked, ``version`` what the text ``format`` must say, where a
-    file has one. Sizes and headers are checked before anything is allocated. Raises `DataError` naming file, key, what
-    was expected and what came: a missing or damaged file, oversized or pickled members, missing keys, another format,
-    wrong kinds or shapes, NaN or infinite numbers.
+    A key is described by its kind (float, int, bool, text, number or a dtype) and its shape, as in ``"float V 3"`` or
+    ``"float V 3 3 | V 4 4"``; a named size is the same wherever it stands. Sizes and headers are checked before
+    anything is allocated. Raises `DataError` naming file and key: damaged, more than ``limit`` bytes unpacked, pickled,
+    missing, another ``version`` in its ``format``, wrong kinds or shapes, NaN or infinite numbers.
     """
     path, optional = Path(path), optional or {}
     if not path.is_file():

@@ -27,11 +27,10 @@ BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 
 
 def write_points(path: str | Path, cloud: PointCloud) -> None:
-    """Writes a cloud as binary little-endian PLY, float32 ``x y z nx ny nz``, metres, and uchar ``red green blue``.
+    """Writes a cloud as binary little-endian PLY, whole or not at all: float32 ``x y z nx ny nz``, uchar colours.
 
-    Colours are written where the cloud has them, 8 bits a channel. Equal clouds give equal bytes. The file appears
-    whole or not at all. Raises `AvatarError` on wrong shapes, no points, non-finite values or colours beyond [0, 1],
-    `DataError` when the file name does not end in .ply.
+    Equal clouds give equal bytes. Raises `AvatarError` on wrong shapes, non-finite values or colours beyond [0, 1],
+    `DataError` for no points or another ending.
     """
     path = Path(path)
     check_suffix(path, (".ply",), "a file name")
@@ -60,10 +59,7 @@ def color_bytes(colors: np.ndarray) -> np.ndarray:
 
 
 def unit_colors(path: Path, colors: np.ndarray, whole: bool) -> np.ndarray:
-    """A file's colours as float32 in [0, 1]: whole numbers are 0 to 255, floats are in [0, 1] already.
-
-    Raises `DataError` for values beyond that range.
-    """
+    """A file's colours as float32 in [0, 1], of whole numbers to 255 or of floats; `DataError` beyond them."""
     highest = 255 if whole else 1
     if colors.size and not 0 <= colors.min() <= colors.max() <= highest:
         problem = f"expected colours from 0 to {highest}, got {colors.min():.4g} to {colors.max():.4g}."
@@ -72,12 +68,11 @@ def unit_colors(path: Path, colors: np.ndarray, whole: bool) -> np.ndarray:
 
 
 def read_points(path: str | Path) -> PointCloud:
-    """Reads an oriented point cloud from a PLY file: float32 points, unit normals and, where it has them, colours.
+    """Reads a PLY of any scalar kind: float32 points, unit normals and, where it has them, colours in [0, 1].
 
-    Foreign files are welcome: ASCII or binary, further properties and elements are ignored. Normals a little off unit
-    length are renormalised. Colours are ``red green blue`` as uchar, or as floats in [0, 1]. Raises `DataError` naming
-    the file and what is wrong with it: missing, another format, damaged, empty, too large, no normals, non-finite
-    values, normals far from unit length, or colours beyond their range.
+    Further properties and elements are ignored, normals a little off unit length renormalised. Raises `DataError`
+    naming the file and what is wrong: damaged, empty, too large, no normals, non-finite values, colours beyond their
+    range.
     """
     path = Path(path)
     check_suffix(path, (".ply",), "a file name")
