@@ -30,8 +30,7 @@ Record = TypeVar("Record")
 
 
 class LruSequence(Sequence[Item]):
-    """A sequence in bounded memory, of what ``read`` gives by index alone; the least recently used items leave first.
-    """
+    """A sequence in bounded memory of what ``read`` gives by index alone; the least recently used items leave first."""
 
     def __init__(self, read: Callable[[int], Item], count: int, max_bytes: int = MAX_BYTES):
         self.read, self.count, self.left = read, count, max(max_bytes, 0)
@@ -93,9 +92,8 @@ class FrameDataset:
         first = outfits[0].template
         for outfit in outfits[1:]:
             if not torch.equal(outfit.template.faces, first.faces):
-                raise AvatarError(
-                    f"outfits: expected one body topology in a run, {outfit.name} has another than {outfits[0].name}."
-                )
+                problem = f"{outfit.name} has another than {outfits[0].name}."
+                raise AvatarError(f"outfits: expected one body topology in a run, {problem}")
         self.outfits, self.names, self.points, self.seed = tuple(outfits), tuple(names), points, seed
         self.frames = LruSequence(self._read, len(self.names), cache_bytes)
 
@@ -249,10 +247,9 @@ def mirror_map(template: Template) -> MirrorMap:
     ids = nearest(mirrored[None], template.vertices[None])[0]
     off = (template.vertices[ids] - mirrored).norm(dim=-1) > MIRROR_TOLERANCE
     if off.float().mean() > 0.01:
-        raise AvatarError(
-            f"mirror: expected a symmetric template, {int(off.sum())} of {len(off)} vertices have no mirror image "
-            "within 5 mm. Train without mirroring (train.mirror=false)."
-        )
+        problem = f"{int(off.sum())} of {len(off)} vertices have no mirror image within 5 mm."
+        hint = "Train without mirroring (train.mirror=false)."
+        raise AvatarError(f"mirror: expected a symmetric template, {problem} {hint}")
     names, swapped = list(template.joint_names), [swap_side(name) for name in template.joint_names]
     missing = [name for name in swapped if name not in names]
     if missing:
@@ -270,14 +267,10 @@ def mirror_batch(batch: Batch, chosen: Tensor, symmetry: MirrorMap) -> Batch:
     """The batch with the chosen frames ``(B,)`` bool seen in a mirror: bodies, transforms and scans alike."""
     flip = ACROSS.diagonal()[:3]
     turned = torch.outer(ACROSS.diagonal(), ACROSS.diagonal())  # signs of ACROSS @ T @ ACROSS
-    images = {
-        "pose_vertices": lambda seen: seen[:, symmetry.vertices] * flip,
-        "vertices": lambda seen: seen[:, symmetry.vertices] * flip,
-        "vertex_transforms": lambda seen: seen[:, symmetry.vertices] * turned,
-        "joint_transforms": lambda seen: seen[:, symmetry.joints] * turned,
-        "scan_points": lambda seen: seen * flip,
-        "scan_normals": lambda seen: seen * flip,
-    }
+    images = dict.fromkeys(("scan_points", "scan_normals"), lambda seen: seen * flip)
+    images |= dict.fromkeys(("pose_vertices", "vertices"), lambda seen: seen[:, symmetry.vertices] * flip)
+    images["vertex_transforms"] = lambda seen: seen[:, symmetry.vertices] * turned
+    images["joint_transforms"] = lambda seen: seen[:, symmetry.joints] * turned
     return change_rows(batch, chosen, images)
 
 

@@ -59,7 +59,6 @@ class OpenOutfit(Outfit):
         return self._make_body(MEAN_SHAPE)
 
     def _make_body(self, shape: str) -> BodyModel:
-        """An open body in the outfit's canonical pose."""
         with naming(self.path / "outfit.yaml", prefix="body: "):
             body = open_body(shape)
             return body.with_canonical_pose(canonical_pose(self._canonical, body.joint_names))

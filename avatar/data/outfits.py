@@ -135,7 +135,6 @@ class Outfit(ABC):
 
     @cached_property
     def _listed(self) -> dict[str, tuple[str, ...]]:
-        """Frame names by split, as the folders have them."""
         return {
             split: tuple(sorted(p.stem for p in (self.path / split).glob("*.npz") if not p.name.startswith(".")))
             for split in SPLITS

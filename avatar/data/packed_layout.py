@@ -97,7 +97,6 @@ class PackedOutfit(Outfit):
         return found
 
     def _body_of(self, key: str) -> BodyModel | None:
-        """One of the outfit's bodies; None where nothing speaks of it."""
         if key not in self._bodies:
             return None
         with naming(self.path / "outfit.yaml"):
@@ -181,7 +180,6 @@ class PackedOutfit(Outfit):
 
 
 def _stored_scan(stored: dict[str, np.ndarray], path: Path) -> Scan:
-    """The scan of a frame, with unit normals."""
     scan = Scan(**{name: stored.get(key) for key, name in SCAN_KEYS.items()})
     normals = scan.normals / np.maximum(np.linalg.norm(scan.normals, axis=1, keepdims=True), 1e-12)
     faces, colors = scan.faces, scan.colors

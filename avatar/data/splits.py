@@ -23,10 +23,8 @@ class SplitConfig:
 
     def __post_init__(self):
         if not 0 <= self.validation_share < 1 or not 0 < self.train_fraction <= 1:
-            raise AvatarError(
-                "validation_share: expected at least 0 and below 1; train_fraction: above 0 and at most 1; "
-                f"got {self.validation_share} and {self.train_fraction}."
-            )
+            expected = "validation_share: expected at least 0 and below 1; train_fraction: above 0 and at most 1"
+            raise AvatarError(f"{expected}; got {self.validation_share} and {self.train_fraction}.")
 
 
 @dataclass(frozen=True)

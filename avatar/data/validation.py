@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.packed import border_positions
 from avatar.checks import AvatarError, DataError, check_finite
-from avatar.geometry.trees import Tree, build_tree
+from avatar.geometry.trees import build_tree
 from avatar.records import Frame, Scan, Template
 
 SKIN_SAMPLES = 500  # places on the body, spread by area
@@ -34,10 +34,7 @@ MOST_TURN = 2 * np.pi + 0.1  # radians; no joint turns farther, and degrees soon
 JOINT_GAP, JOINTS_GAP = 0.25, 0.12  # metres from a joint to its weights' border: one, median (open body: 0.13, 0.04)
 APART, SHARE = 0.05, 0.99  # metres between posed bodies at that share of vertices: margin for lost blendshapes
 EDGE_ERROR = 0.18  # of the edges' length: 0.03 to 0.10 where right (sample outfits), 0.27 and more for no rotation
-AXES = (  # two joints, where the second lies from the first
-    ("pelvis", "neck", "+y"),
-    ("right_hip", "left_hip", "+x"),
-)
+AXES = (("pelvis", "neck", "+y"), ("right_hip", "left_hip", "+x"))  # two joints, where the second lies from the first
 TURNS = {  # where it should lie and where it does: what corrects it
     ("+y", "-y"): "Turn body and scans by 180 degrees about z: (x, y, z) to (-x, -y, z).",
     ("+y", "+z"): "Turn body and scans by -90 degrees about x: (x, y, z) to (x, z, -y).",
@@ -160,7 +157,6 @@ def _check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, pa
 
 
 def _unit_hint(size: float) -> str:
-    """What to do about a person of a wrong size."""
     for unit, factor in UNITS.items():
         if BODY_HEIGHT[0] <= size / factor <= 2 * BODY_HEIGHT[1]:
             return f"That looks like {unit}: divide positions and translations by {factor} (multiply by {1 / factor})."
@@ -185,7 +181,7 @@ def measure_overlap(points: np.ndarray, normals: np.ndarray, vertices: np.ndarra
     _, below = build_tree(centres).query(points[some])
     heights = ((points[some] - centres[below]) * outward[below]).sum(axis=1)
     return Overlap(
-        covered=_covered(skin, *_scan_tree(points)),
+        covered=_coverage(points)(skin),
         buried=float((heights < -DEEP).mean()),
         outward=float(((normals[some] * outward[below]).sum(axis=1) > 0).mean()),
     )
@@ -209,16 +205,12 @@ def _thin(count: int, most: int) -> np.ndarray:
     return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
 
 
-def _scan_tree(points: np.ndarray) -> tuple[Tree, float]:
-    """Some of a scan's points to search, and how far from skin one of them must be found, metres."""
+def _coverage(points: np.ndarray) -> Callable[[np.ndarray], float]:
+    """What measures the share of places on the skin with one of a scan's points within reach."""
     some = points[_thin(len(points), SCAN_SAMPLES)]
-    spacing = np.sqrt(2 / len(some))  # of points on two square metres of person
-    return build_tree(some), max(NEAR, 2 * spacing)
-
-
-def _covered(skin: np.ndarray, tree: Tree, reach: float) -> float:
-    """Share of places on the skin with a scan point within reach."""
-    return float(np.isfinite(tree.query(skin, distance_upper_bound=reach)[0]).mean())
+    tree, spacing = build_tree(some), np.sqrt(2 / len(some))  # of points on two square metres of person
+    reach = max(NEAR, 2 * spacing)
+    return lambda skin: float(np.isfinite(tree.query(skin, distance_upper_bound=reach)[0]).mean())
 
 
 def _check_overlap(overlap: Overlap, scan: Scan, body: np.ndarray, faces: np.ndarray, path: Path) -> None:
@@ -243,15 +235,15 @@ def _check_overlap(overlap: Overlap, scan: Scan, body: np.ndarray, faces: np.nda
 
 def suggest_hint(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> str:
     """What would lay a scan over its body: a move, a turn by right angles, a mirror; or that none of them does."""
-    (_, _, skin), (tree, reach) = _face_frames(vertices, faces), _scan_tree(points)
+    covered, (_, _, skin) = _coverage(points), _face_frames(vertices, faces)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     best, words, corrected = 0.0, "", points
     for name, linear in _mistakes():
         moved = skin @ linear  # the inverse of an orthogonal matrix is its transpose: the body goes to the scan
-        if name and (share := _covered(moved, tree, reach)) > best:
+        if name and (share := covered(moved)) > best:
             best, words, corrected = share, name, points @ linear.T
         shift = middle - (moved.min(axis=0) + moved.max(axis=0)) / 2
-        share = _covered(moved + shift, tree, reach)
+        share = covered(moved + shift)
         if share > best + 0.02:  # a suggestion without a move is the simpler one
             back = -linear @ shift
             words = f"{name} and moving it by {_vector(back)} m" if name else f"Moving it by {_vector(back)} m"
@@ -274,7 +266,6 @@ def _mistakes() -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _vector(steps: np.ndarray, digits: int = 2) -> str:
-    """A vector in a message."""
     return f"({', '.join(f'{step:.{digits}f}' for step in steps)})"
 
 
@@ -378,22 +369,20 @@ def check_pose(pose: np.ndarray, joints: int) -> None:
 
 
 def _pose_hint(shape: tuple[int, ...], joints: int) -> str:
-    """What a pose of another shape looks like, and how to write it as axis-angle."""
-    if shape[-2:] == (3, 3) and len(shape) == 3:
-        return "These are rotation matrices: scipy.spatial.transform.Rotation.from_matrix(pose).as_rotvec()."
-    if len(shape) == 2 and shape[1] == 4:
-        return "These are quaternions: scipy.spatial.transform.Rotation.from_quat(pose).as_rotvec(), x y z w."
-    if shape == (joints, 6):
-        return "These are 6D rotations: make matrices of them, then rotation vectors."
-    if shape in ((joints * 3,), (1, joints * 3)):
-        return f"It is flat: pose.reshape({joints}, 3)."
-    total = int(np.prod(shape)) if shape else 0
-    flat = len(shape) == 1 or shape[:1] == (1,)
-    if total % 3 == 0 and total > joints * 3 and (flat or (len(shape) == 2 and shape[1] == 3)):
-        count = total // 3
-        first = f"pose.reshape({count}, 3)[:{joints}]" if flat else f"pose[:{joints}]"
-        return f"It has {count} joints; where the first {joints} are this body's, as for SMPL and SMPL-X: {first}."
-    return "One rotation vector a joint, relative to its parent."
+    total, flat = int(np.prod(shape)) if shape else 0, len(shape) == 1 or shape[:1] == (1,)
+    count = total // 3
+    first = f"pose.reshape({count}, 3)[:{joints}]" if flat else f"pose[:{joints}]"
+    longer = total % 3 == 0 and count > joints and (flat or (len(shape) == 2 and shape[1] == 3))
+    rotation = "scipy.spatial.transform.Rotation"
+    hints = {
+        f"These are rotation matrices: {rotation}.from_matrix(pose).as_rotvec().": shape[1:] == (3, 3),
+        f"These are quaternions: {rotation}.from_quat(pose).as_rotvec(), x y z w.": shape[1:] == (4,),
+        "These are 6D rotations: make matrices of them, then rotation vectors.": shape == (joints, 6),
+        f"It is flat: pose.reshape({joints}, 3).": flat and total == joints * 3,
+        f"It has {count} joints; where the first {joints} are this body's, as for SMPL and SMPL-X: {first}.": longer,
+        "One rotation vector a joint, relative to its parent.": True,
+    }
+    return next(hint for hint, fits in hints.items() if fits)
 
 
 def check_frame_count(names: Sequence[str], path: Path, what: str, least: int = 2) -> None:

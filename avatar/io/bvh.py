@@ -63,14 +63,12 @@ def read_bvh(path: Path) -> BvhMotion:
 
 
 def _expect(tokens: deque[str], *expected: str) -> None:
-    """Takes expected tokens from the front."""
     for token in expected:
         if (found := tokens.popleft()) != token:
             raise ValueError(f"{found!r} stands where {token!r} was expected")
 
 
 def _read_hierarchy(tokens: deque[str]) -> list[_Joint]:
-    """The joints, taken from the front of a file's tokens."""
     if (tokens[0], tokens[1]) != ("HIERARCHY", "ROOT"):
         raise ValueError(f"it begins with {f'{tokens[0]} {tokens[1]}'!r}, not with HIERARCHY ROOT")
     tokens.popleft()

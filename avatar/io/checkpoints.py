@@ -16,10 +16,8 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
+import safetensors.torch
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
@@ -88,7 +86,6 @@ def _is_finite(value: Tensor) -> bool:
 
 
 def _check_weights(weights: Iterable[tuple[str, Tensor]], what: str) -> None:
-    """Refuses weights that are not finite before a file of them is written."""
     for name, value in weights:
         if not _is_finite(value):
             raise AvatarError(f"{name}: expected finite weights{what} was not written.")
@@ -205,7 +202,7 @@ def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
 def write_weights(path: Path, weights: dict[str, Tensor], description: dict[str, Any]) -> None:
     """Writes ``<path>.safetensors`` and ``<path>.json`` (description, sha256); `AvatarError` if not finite."""
     _check_weights(weights.items(), f"; {path}.safetensors")
-    data = save_tensors({name: value.contiguous().cpu() for name, value in weights.items()})
+    data = safetensors.torch.save({name: value.contiguous().cpu() for name, value in weights.items()})
     described = description | {"sha256": hashlib.sha256(data).hexdigest()}
     write_whole(path.with_suffix(".safetensors"), data)
     write_whole(path.with_suffix(".json"), json.dumps(described, indent=1).encode())
@@ -226,9 +223,9 @@ def read_weights(path: Path, facts: Iterable[str] = ()) -> tuple[dict[str, Tenso
         hint = "Give the command that made it again."
         raise DataError(weights, "damaged: its sha256 is not the one in its description.", hint)
     try:
-        tensors = load_tensors(data)
+        tensors = safetensors.torch.load(data)
         for name, value in tensors.items():
             check_finite(name, value)
-    except (SafetensorError, AvatarError) as error:
+    except (safetensors.SafetensorError, AvatarError) as error:
         raise DataError(weights, f"expected finite weights ({error}).") from error
     return tensors, description

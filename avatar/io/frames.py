@@ -144,7 +144,6 @@ def read_open_garment(path: Path) -> OpenGarment:
 
 
 def _check_garment(garment: OpenGarment) -> None:
-    """Refuses faces or labels that point at nothing."""
     check_faces(np.asarray(garment.faces), len(garment.canonical))
     labels = np.asarray(garment.labels)
     if labels.min() < 1 or labels.max() > len(garment.names):

@@ -160,10 +160,7 @@ def read_obj_atlas(path: str | Path, faces: np.ndarray, vertices: int) -> MeshAt
 
 
 def _corner(word: str, vertices: int, places: int) -> tuple[int, int | None]:
-    """Vertex and place in the atlas of a corner such as ``12/7/3`` or ``12``; negative numbers count from the last.
-
-    Raises `ValueError` for what is no corner, or points to nothing.
-    """
+    """Vertex and place in the atlas of a corner such as ``12/7/3`` or ``12``; negative numbers count from the last."""
     found = []
     for digits, count in zip(word.split("/")[:2], (vertices, places)):
         number = int(digits or 0)

@@ -245,10 +245,8 @@ def map_joints(names: Sequence[str], parents: Sequence[int]) -> dict[int, int]:
     found.setdefault(0, 0)
     missing = [joint for joint in NEEDED if INDEX[joint] not in found]
     if missing:
-        raise AvatarError(
-            f"joints: expected the names of a SMPL, Mixamo, CMU or LAFAN skeleton, found none for {', '.join(missing)} "
-            f"among {', '.join(names[:40])}."
-        )
+        problem = f"found none for {', '.join(missing)} among {', '.join(names[:40])}."
+        raise AvatarError(f"joints: expected the names of a SMPL, Mixamo, CMU or LAFAN skeleton, {problem}")
     upper = found.get(INDEX["neck"], found[INDEX["left_shoulder"]])
     chain = []
     while (upper := parents[upper]) > found[0]:
@@ -268,14 +266,6 @@ def _local_poses(turns: dict[int, np.ndarray], parents: Sequence[int], frames: i
         world[:, joint] = turns.get(joint, above)
         poses[:, joint] = Rotation.from_matrix(np.swapaxes(above, 1, 2) @ world[:, joint]).as_rotvec()
     return poses
-
-
-def _mapped_parent(joint: int, source: dict[int, int]) -> int:
-    """The nearest joint above that the skeleton has too; -1 for the root."""
-    parent = SMPL_PARENTS[joint]
-    while parent >= 0 and parent not in source:
-        parent = SMPL_PARENTS[parent]
-    return parent
 
 
 def _aligned_rest(source: dict[int, int], rest: np.ndarray, offsets: np.ndarray) -> dict[int, np.ndarray] | None:
@@ -304,10 +294,7 @@ def _aligned_rest(source: dict[int, int], rest: np.ndarray, offsets: np.ndarray)
 
 
 def _align(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """The rotation ``(3, 3)`` from our bones to theirs: the shortest for one bone, the best fit for several.
-
-    Bones without length (joints at one place) say nothing and are left out.
-    """
+    """The rotation ``(3, 3)`` nearest to turning our bones onto theirs; bones without length are left out."""
     lengths = np.linalg.norm(theirs, axis=1)
     known = lengths > 1e-6 * max(lengths.max(), 1e-12)
     ours, theirs = (b[known] / np.linalg.norm(b[known], axis=1, keepdims=True) for b in (ours, theirs))
@@ -321,10 +308,14 @@ def _calibrated_turns(bvh: BvhMotion, source: dict[int, int], rest: np.ndarray) 
     some = np.unique(np.linspace(0, len(bvh.positions) - 1, CALIBRATION_FRAMES).astype(int))
     rotations, positions = bvh.rotations[some], bvh.positions[some]
     pointing: dict[int, np.ndarray] = {-1: np.tile(np.eye(3), (len(some), 1, 1))}
-    turns = {}
+    turns, parents = {}, {}  # parents: the nearest joint above that the skeleton has too; -1 for the root
+    for joint in source:
+        parents[joint] = SMPL_PARENTS[joint]
+        while parents[joint] >= 0 and parents[joint] not in source:
+            parents[joint] = SMPL_PARENTS[parents[joint]]
     for joint, index in source.items():
-        pointing[joint] = above = pointing[_mapped_parent(joint, source)]
-        children = [child for child in source if _mapped_parent(child, source) == joint]
+        pointing[joint] = above = pointing[parents[joint]]
+        children = [child for child in source if parents[child] == joint]
         if children:
             bones = positions[:, [source[child] for child in children]] - positions[:, index : index + 1]
             posed = np.einsum("tij,bj->tbi", above, rest[children] - rest[joint])
@@ -335,7 +326,6 @@ def _calibrated_turns(bvh: BvhMotion, source: dict[int, int], rest: np.ndarray) 
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
-    """Degrees between two directions."""
     cosine = a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12)
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 

@@ -137,7 +137,6 @@ def _read_header(path: Path, data: bytes) -> tuple[np.dtype, int, memoryview, bo
 
 
 def _read_binary(path: Path, data: memoryview, row: np.dtype, count: int, columns: tuple[str, ...]) -> np.ndarray:
-    """Some properties as ``(N, C)`` float64, from the rows of a binary file."""
     if count * row.itemsize > len(data):
         held = len(data) // row.itemsize
         raise DataError(path, f"cut short: the header promises {count} vertices, the file holds {held}.")
@@ -146,7 +145,6 @@ def _read_binary(path: Path, data: memoryview, row: np.dtype, count: int, column
 
 
 def _read_ascii(path: Path, data: memoryview, row: np.dtype, count: int, columns: tuple[str, ...]) -> np.ndarray:
-    """The same from the lines of an ASCII file."""
     lines = [line for line in str(data, "latin-1").splitlines() if line.strip()][:count]
     if len(lines) < count:
         raise DataError(path, f"cut short: the header promises {count} vertices, got {len(lines)} lines.")
