@@ -19,9 +19,8 @@ from avatar.evaluation.metrics import Comparison, find_metrics
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.meshes import write_mesh
-from avatar.io.motions import read_body_motion
+from avatar.io.motions import move_body, read_body_motion
 from avatar.io.points import write_points
-from avatar.io.retargeting import move_body
 from avatar.methods.settings import RunConfig
 from avatar.records import Mesh, Motion, PointCloud, Scan, Surface
 from avatar.runs.training import load_avatar, train

@@ -21,7 +21,7 @@ from avatar.environment import choose_device
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.io.canonical_scans import write_canonical_scan
+from avatar.io.frames import write_canonical_scan
 from avatar.io.motions import write_motion
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, CanonicalizerTask, CycleConfig

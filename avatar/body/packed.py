@@ -14,7 +14,7 @@ from avatar.body.model import BodyModel, check_bind
 from avatar.body.skinning import blend_transforms, check_parents
 from avatar.checks import AvatarError, DataError, check_shape
 from avatar.geometry.transforms import invert_affine, invert_rigid, transform_points
-from avatar.io.atlases import read_obj_atlas
+from avatar.io.meshes import read_obj_atlas
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import Template
 

@@ -15,10 +15,7 @@ OUTFIT_FORMAT = "outfit/1"
 
 
 def read_outfit_settings(path: Path) -> dict[str, Any]:
-    """What an outfit's ``outfit.yaml`` says, or nothing where there is none.
-
-    Raises `DataError` for a file that is not a plain mapping, or of an unknown format.
-    """
+    """What ``outfit.yaml`` says, nothing where there is none; `DataError` for no mapping or an unknown format."""
     file = Path(path) / "outfit.yaml"
     if not file.is_file():
         return {}
@@ -29,10 +26,9 @@ def read_outfit_settings(path: Path) -> dict[str, Any]:
 
 
 def outfit_folder(root: Path, dataset: str, outfit: str) -> Path:
-    """The folder of an outfit: ``<root>/<dataset>/<outfit>``, or the embedded one for the dataset ``sample``.
+    """The folder ``<root>/<dataset>[/packed]/<outfit>``, or the embedded one for the dataset ``sample``.
 
-    POP's nesting ``<root>/<dataset>/packed/<outfit>`` is found as well. Raises `AvatarError` for names that could leave
-    the data root; `DataError` for a data set or an outfit that is not there, naming those that are.
+    Raises `AvatarError` for names that could leave the data root; `DataError` naming the outfits that are there.
     """
     check_name("dataset", dataset)
     check_name("outfit", outfit)

@@ -18,8 +18,7 @@ from avatar.canonical.fields import BodyField, SkinningField, bounding_box
 from avatar.canonical.scans import STRETCH, DrawConfig, PosedScan, ScanBatch, draw_batch, prepare_scan, to_root_frame
 from avatar.checks import DataError, check_name, check_range
 from avatar.data.batches import FrameDataset, name_frames
-from avatar.data.canonical_frames import CanonicalOutfit
-from avatar.data.layouts import find_outfit
+from avatar.data.layouts import CanonicalOutfit, find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit

@@ -12,9 +12,14 @@ from torch import Tensor
 
 from avatar.canonical.fields import BodyField, SkinningField, SkinningFieldConfig, bounding_box
 from avatar.checks import AvatarError, DataError, check_range
-from avatar.data.batches import LruSequence
-from avatar.data.canonical_frames import CanonicalBatch, CanonicalFrame, CanonicalFrames, canonical_frame
-from avatar.data.mirroring import mirror_map
+from avatar.data.batches import (
+    CanonicalBatch,
+    CanonicalFrame,
+    CanonicalFrames,
+    LruSequence,
+    canonical_frame,
+    mirror_map,
+)
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.environment import choose_device

@@ -21,7 +21,7 @@ from avatar.evaluation.scoring import Label
 from avatar.evaluation.tables import to_markdown
 from avatar.export import pictures
 from avatar.export.pictures import load_pyvista
-from avatar.io.canonical_scans import read_canonical_scan
+from avatar.io.frames import read_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, module_digest
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole

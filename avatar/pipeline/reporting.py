@@ -11,8 +11,8 @@ import numpy as np
 import yaml
 
 from avatar.checks import AvatarError, DataError, check_name
-from avatar.data.layouts import find_outfit
 from avatar.data.folders import SPLITS, VALIDATION
+from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import ScanConfig
 from avatar.environment import prepared_process

@@ -15,8 +15,8 @@ from avatar.checks import DataError
 from avatar.data.batches import FrameDataset, LruSequence
 from avatar.data.validation import check_frame_count
 from avatar.environment import choose_device, prepared_process
-from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.checkpoints import read_weights, write_weights
+from avatar.io.frames import write_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, file_digest, keyed, module_digest
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points

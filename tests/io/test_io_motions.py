@@ -14,9 +14,8 @@ from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError, check_name
 from avatar.cli import make_motion
-from avatar.io.motions import read_body_motion, read_motion, resample_motion, write_motion
+from avatar.io.motions import move_body, read_body_motion, read_motion, resample_motion, write_motion
 from avatar.io.npz import write_arrays
-from avatar.io.retargeting import move_body
 from avatar.records import Motion, Template
 from avatar.simulate.sequences import authored_motion
 

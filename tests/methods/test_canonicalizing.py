@@ -22,7 +22,7 @@ from avatar.evaluation.canonical import CANONICAL_METRICS
 from avatar.evaluation.scores import read_scores
 from avatar.geometry import neighbours
 from avatar.geometry.transforms import transform_points
-from avatar.io.canonical_scans import read_canonical_scan
+from avatar.io.frames import read_canonical_scan
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import (

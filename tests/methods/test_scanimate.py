@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 from avatar.canonical.fields import BodyField
 from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError, DataError
-from avatar.data.canonical_frames import CanonicalFrames, canonical_frame
+from avatar.data.batches import CanonicalFrames, canonical_frame
 from avatar.data.splits import SplitConfig
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.implicit.losses import QueryConfig
-from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.checkpoints import load_checkpoint
+from avatar.io.frames import read_canonical_scan, write_canonical_scan
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
@@ -233,7 +233,7 @@ def test_batches_depend_on_nothing_but_the_step(frames):
 
 
 def test_mirrored_frames_are_the_mirror_image_of_scan_and_pose(frames, tiny_outfit):
-    from avatar.data.mirroring import ACROSS, mirror_coins, mirror_map
+    from avatar.data.batches import ACROSS, mirror_coins, mirror_map
 
     symmetry = mirror_map(tiny_outfit.template)
     plain, mirrored = CanonicalFrames(frames, 50, 0), CanonicalFrames(frames, 50, 0, symmetry)

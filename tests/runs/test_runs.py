@@ -10,7 +10,7 @@ from tiny import SETTINGS, quick_training
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError
-from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
+from avatar.data.batches import mirror_batch, mirror_coins, mirror_map
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.io.checkpoints import save_checkpoint
