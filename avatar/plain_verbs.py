@@ -116,7 +116,7 @@ def make_motion() -> None:
     options = parser.parse_args()
 
     from avatar.io.motions import write_motion
-    from avatar.simulate.sequences import authored_motion
+    from avatar.simulate.angles import authored_motion
 
     with refusals("make_motion"):
         motion = authored_motion(options.name, options.fps, options.seconds)

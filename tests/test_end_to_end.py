@@ -26,7 +26,7 @@ from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.demo import DemoConfig, demo
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 pytestmark = pytest.mark.slow
 METRICS = ["cd_point", "cd_pop", "normal_l1", "penetration_share"]

@@ -15,14 +15,13 @@ from avatar.checks import AvatarError, unknown_name
 from avatar.environment import prepared_process
 from avatar.io.motions import read_motion, resample_motion
 from avatar.records import Motion
+from avatar.simulate.angles import EVERYDAY, SEQUENCES, authored_motion
 from avatar.simulate.dressing import TravelConfig, pose_path
-from avatar.simulate.everyday import EVERYDAY
 from avatar.simulate.gates import FrameReport, GateConfig
 from avatar.simulate.memory import history_error, pose_sensitivity
 from avatar.simulate.outfits import DEFAULT_SHAPES, OUTFIT_NAMES, OutfitConfig, outfit
 from avatar.simulate.poses import KINDS, NamedPose, draw_poses, everyday_poses, split_distances
 from avatar.simulate.production import dress, simulate_outfit
-from avatar.simulate.sequences import SEQUENCES, authored_motion
 from avatar.values import FileName
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from avatar.io.npz import write_arrays
 from avatar.io.retargeting import move_body
 from avatar.plain_verbs import make_motion
 from avatar.records import Motion, Template
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 
 @pytest.fixture(scope="module")
