@@ -23,9 +23,8 @@ from avatar.simulate.implicit import (
     relax,
     surface_nets,
 )
-from avatar.simulate.layering import lift_off
+from avatar.simulate.mesh_queries import body_distances, lift_off
 from avatar.simulate.outfits import GarmentConfig
-from avatar.simulate.visibility import body_distances
 
 PAD = 0.12  # metres of free grid around the body
 SHORTEST = 0.45  # shortest edge in the finished mesh, in target edge lengths, before the last relaxation

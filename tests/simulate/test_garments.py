@@ -9,8 +9,8 @@ from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.simulate.garments import NECK_FOOT, Cutting, cut_garment
 from avatar.simulate.implicit import mesh_edges
+from avatar.simulate.mesh_queries import body_distances
 from avatar.simulate.outfits import GARMENTS, OUTFIT_NAMES, FabricConfig, GarmentConfig, outfit
-from avatar.simulate.visibility import body_distances
 
 pytest.importorskip("warp")
 
