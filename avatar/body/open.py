@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avatar.body.anny import t_pose_from_bind
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
-from avatar.body.packed import dense_weights, sparse_weights
+from avatar.body.packed import dense_weights, sparse_weights, template_of
 from avatar.checks import AvatarError, DataError
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import Template
@@ -19,30 +19,35 @@ ASSET = Path(__file__).parents[1] / "assets" / "open_body.npz"
 MEAN_SHAPE = "mean"  # the average of all shapes: what a pose encoder sees, whichever subject it is
 UV_STEPS = 65535
 KEPT_WEIGHTS = 5  # with 16 bits each they pose within 0.02 mm of all weights; four, or 8 bits, lose millimetres
+KEYS = {
+    "vertices": "float S V 3",
+    "joints": f"float S {len(SMPL_JOINTS)} 3",
+    "zero_from_bind": f"float S {len(SMPL_JOINTS)} 4 4",
+    **{"faces": "int F 3", "weight_joints": "int V K", "weight_values": "int V K"},
+}
 
 
 def write_open_bodies(path: Path, shapes: dict[str, tuple[Template, Tensor]]) -> None:
-    """Writes bodies of one topology to a compact asset: uint16 faces, the five largest skinning weights as uint16.
+    """Writes bodies of one topology to a compact npz: uint16 faces, the five largest skinning weights as uint16.
 
-    Args:
-        path: the npz to write.
-        shapes: name to bind template and its ``zero_from_bind (J, 4, 4)``; the first one's UV atlas is everyone's.
-            A vertex's first UV coordinate must have the vertex's own number, so that ``uv_faces`` packs to little.
+    By name, each has a bind template and its ``zero_from_bind (J, 4, 4)``; the first one's UV atlas is everyone's. A
+    vertex's first UV coordinate must have the vertex's own number, so that ``uv_faces`` packs to little.
     """
     templates = [template for template, _ in shapes.values()]
-    ids, values = sparse_weights(templates[0].weights.numpy(), KEPT_WEIGHTS)
+    first = templates[0]
+    ids, values = sparse_weights(first.weights.numpy(), KEPT_WEIGHTS)
     arrays = {
         "shapes": np.array(list(shapes)),
         "vertices": np.stack([t.vertices.numpy() for t in templates]).astype(np.float32),
         "joints": np.stack([t.joints.numpy() for t in templates]).astype(np.float32),
         "zero_from_bind": np.stack([zero.numpy() for _, zero in shapes.values()]).astype(np.float32),
-        "faces": templates[0].faces.numpy().astype(np.uint16),
+        "faces": first.faces.numpy().astype(np.uint16),
         "weight_joints": np.where(values > 0, ids, 0).astype(np.uint8),
         "weight_values": np.rint(values * 65535).astype(np.uint16),
     }
-    if templates[0].uv is not None:
-        arrays["uv"] = np.rint(templates[0].uv.numpy() * UV_STEPS).astype(np.uint16)
-        arrays["uv_seams"] = (templates[0].uv_faces - templates[0].faces).numpy().astype(np.uint16)
+    if first.uv is not None:
+        arrays["uv"] = np.rint(first.uv.numpy() * UV_STEPS).astype(np.uint16)
+        arrays["uv_seams"] = (first.uv_faces - first.faces).numpy().astype(np.uint16)
     write_arrays(path, arrays)
 
 
@@ -60,36 +65,24 @@ def open_body(shape: str = "female", canonical_pose: Tensor | None = None) -> Bo
     if shape not in (*names, MEAN_SHAPE):
         raise AvatarError(f"shape: expected one of {', '.join(names)} or {MEAN_SHAPE}, got {shape!r}.")
     which = list(range(len(names))) if shape == MEAN_SHAPE else [names.index(shape)]
-    arrays = _asset(
-        {
-            "vertices": "float S V 3",
-            "joints": f"float S {len(SMPL_JOINTS)} 3",
-            "zero_from_bind": f"float S {len(SMPL_JOINTS)} 4 4",
-            "faces": "int F 3",
-            "weight_joints": "int V K",
-            "weight_values": "int V K",
-        },
-        {"uv": "int U 2", "uv_seams": "int F 3"},
-    )
-    weights = dense_weights(arrays["weight_joints"], arrays["weight_values"], len(SMPL_JOINTS))
-    faces = torch.from_numpy(arrays["faces"].astype(np.int64))
-    bind = Template(
-        vertices=torch.from_numpy(arrays["vertices"][which].mean(axis=0)),
+    arrays = _asset(KEYS, {"uv": "int U 2", "uv_seams": "int F 3"})
+    faces = arrays["faces"].astype(np.int64)
+    bind = template_of(
+        SMPL_PARENTS,
+        SMPL_JOINTS,
+        vertices=arrays["vertices"][which].mean(axis=0),
         faces=faces,
-        weights=torch.from_numpy(weights),
-        joints=torch.from_numpy(arrays["joints"][which].mean(axis=0)),
-        parents=SMPL_PARENTS,
-        joint_names=tuple(SMPL_JOINTS),
-        uv=torch.from_numpy(arrays["uv"] / np.float32(UV_STEPS)) if "uv" in arrays else None,
-        uv_faces=faces + torch.from_numpy(arrays["uv_seams"].astype(np.int64)) if "uv_seams" in arrays else None,
+        weights=dense_weights(arrays["weight_joints"], arrays["weight_values"], len(SMPL_JOINTS)),
+        joints=arrays["joints"][which].mean(axis=0),
+        uv=arrays["uv"] / np.float32(UV_STEPS) if "uv" in arrays else None,
+        uv_faces=faces + arrays["uv_seams"] if "uv_seams" in arrays else None,
     )
-    if shape == MEAN_SHAPE:
-        return BodyModel(bind, t_pose_from_bind(bind), canonical_pose)
-    return BodyModel(bind, torch.from_numpy(arrays["zero_from_bind"][which[0]]), canonical_pose)
+    mean = shape == MEAN_SHAPE
+    zero_from_bind = t_pose_from_bind(bind) if mean else torch.from_numpy(arrays["zero_from_bind"][which[0]])
+    return BodyModel(bind, zero_from_bind, canonical_pose)
 
 
 def _asset(keys: dict[str, str], optional: dict[str, str] | None = None) -> dict[str, np.ndarray]:
-    """Arrays of the asset."""
     if not ASSET.is_file():
         hint = f"Reinstall, or run tools/export_body.py {ASSET}."
         raise DataError(ASSET, "the open body's asset is missing.", hint)

@@ -38,8 +38,7 @@ class BodyConfig:
         if self.name not in BODIES:
             raise unknown_name("body.name", self.name, BODIES)
         if self.canonical not in CANONICAL_POSES:
-            known = ", ".join(CANONICAL_POSES)
-            raise AvatarError(f"body.canonical: expected one of {known}, got {self.canonical!r}.")
+            raise unknown_name("body.canonical", self.canonical, CANONICAL_POSES)
         if self.betas and self.name not in DOWNLOAD_PAGES:
             raise AvatarError(f"body.betas: expected none, as a body of kind {self.name} has no such shape.")
         if self.name == "packed" and not self.path:
@@ -59,15 +58,11 @@ def load_body(config: BodyConfig) -> BodyModel:
 
 
 def body_of_file(path: Path, settings: dict[str, Any], name: str = "") -> BodyModel:
-    """The body in a file, whichever of this project's commands wrote it.
+    """The body in a file: a converted SMPL, SMPL-H or SMPL-X model, or a ``template.npz`` (see `packed_body`).
 
-    Args:
-        path: a converted SMPL, SMPL-H or SMPL-X model, or a ``template.npz`` (see `packed_body`).
-        settings: options of `BodyConfig` but ``name`` and ``path``; ``model``, if any, is what the file must hold.
-        name: where the settings stand, for messages.
-
-    Raises `AvatarError` for an unknown option; `DataError` for a missing or damaged file or one of another kind, with
-    the command that makes a good one.
+    Settings are options of `BodyConfig` but ``name`` and ``path``; ``model``, if any, is what the file must hold, and
+    ``name`` where they stand, for messages. Raises `AvatarError` for an unknown option; `DataError` for a missing or
+    damaged file or one of another kind, with the command that makes a good one.
     """
     given = dict(settings)
     model = given.pop("model", None) or ("packed" if holds_template(path) else converted_kind(path))
@@ -99,15 +94,12 @@ def canonical_name(body: BodyModel) -> str:
 
 
 def _smpl(config: BodyConfig) -> BodyModel:
-    """A body of the SMPL family."""
     return smpl_body(Path(config.path), config.betas, config.all_joints, kind=config.name)
 
 
 BODIES = {
     "open": lambda config: open_body(config.shape),
     "anny": lambda config: anny_body(config.phenotype),
-    "smpl": _smpl,
-    "smplh": _smpl,
-    "smplx": _smpl,
+    **dict.fromkeys(DOWNLOAD_PAGES, _smpl),
     "packed": lambda config: packed_body(Path(config.path)),
 }
