@@ -16,7 +16,7 @@ from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import axis_angle_from_rotation, rotation_from_axis_angle, transform_points
 from avatar.geometry.trees import build_tree
 from avatar.simulate.garments import Garment, cut_garment
-from avatar.simulate.implicit import smoothing_matrix
+from avatar.simulate.level_sets import smoothing_matrix
 from avatar.simulate.mesh_queries import lift_off, tuck
 from avatar.simulate.outfits import OutfitConfig
 from avatar.simulate.solver import ClothSolver, SolverConfig

@@ -12,7 +12,7 @@ from avatar.checks import AvatarError
 from avatar.io.frames import OpenFrame, write_open_frame
 from avatar.records import Motion
 from avatar.simulate.dressing import DressedBody
-from avatar.simulate.implicit import mesh_edges
+from avatar.simulate.level_sets import mesh_edges
 from avatar.simulate.mesh_queries import penetration_depths, visible_faces
 from avatar.simulate.outfits import check_positive
 from avatar.simulate.poses import NamedPose

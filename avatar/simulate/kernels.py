@@ -5,7 +5,7 @@ A module of its own because warp compiles a module as a whole, again after every
 
 import warp as wp
 
-Floats, Vectors, Matrices = wp.array(dtype=float), wp.array(dtype=wp.vec3), wp.array(dtype=wp.mat33)
+Floats, Vectors, Matrices, Flags = (wp.array(dtype=kind) for kind in (float, wp.vec3, wp.mat33, wp.uint8))
 
 
 @wp.kernel
@@ -132,14 +132,7 @@ def tuck_under(mesh: wp.uint64, normals: Vectors, gap: float, reach: float, poin
 
 
 @wp.kernel
-def see_faces(
-    mesh: wp.uint64,
-    origins: Vectors,
-    normals: Vectors,
-    views: Vectors,
-    lift: float,
-    seen: wp.array(dtype=wp.uint8),
-):
+def see_faces(mesh: wp.uint64, origins: Vectors, normals: Vectors, views: Vectors, lift: float, seen: Flags):
     """Marks faces seen from their front by an orthographic camera: a ray towards it meets nothing."""
     i = wp.tid()
     for k in range(views.shape[0]):
