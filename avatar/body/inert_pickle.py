@@ -68,9 +68,10 @@ class Inert:
 
 def as_array(value: Any) -> np.ndarray:
     """The numbers of a stand-in, or of a plain list."""
-    if isinstance(value, Inert) and type(value).__name__ not in READERS:
+    read = KNOWN[type(value).__name__][0] if isinstance(value, Inert) else np.asarray
+    if read is None:
         raise AvatarError(f"{type(value).__name__} stands for no array")
-    array = READERS[type(value).__name__](value) if isinstance(value, Inert) else np.asarray(value)
+    array = read(value)
     if array.dtype.kind not in "biuf":
         raise AvatarError(f"not numbers but {array.dtype}")
     return array
@@ -123,31 +124,22 @@ def read_object(stored: Inert) -> np.ndarray:
     return as_array(twin)
 
 
-READERS = {
-    "_reconstruct": read_array,
-    "ndarray": read_array,
-    "_frombuffer": read_buffer,
-    "csc_matrix": read_sparse,
-    "csr_matrix": read_sparse,
-    "Ch": lambda stored: as_array(stored.state["x"]),  # chumpy's plain array
-    "Select": read_selection,
-    "_reconstructor": read_object,
+MULTIARRAY, NUMERIC = (("numpy.core." + part, "numpy._core." + part) for part in ("multiarray", "numeric"))
+KNOWN = {  # all that a pickle may name: what reads an object of that name, and the modules it may be in
+    "_reconstruct": (read_array, *MULTIARRAY),
+    "_frombuffer": (read_buffer, *NUMERIC),
+    "ndarray": (read_array, "numpy"),
+    "csc_matrix": (read_sparse, "scipy.sparse.csc", "scipy.sparse._csc"),
+    "csr_matrix": (read_sparse, "scipy.sparse.csr", "scipy.sparse._csr"),
+    "Ch": (lambda stored: as_array(stored.state["x"]), "chumpy.ch"),  # chumpy's plain array
+    "Select": (read_selection, "chumpy.reordering"),
+    "_reconstructor": (read_object, "copy_reg", "copyreg"),
+    "dtype": (None, "numpy"),
+    "scalar": (None, *MULTIARRAY),
+    "object": (None, "__builtin__", "builtins"),
+    "encode": (None, "_codecs"),
 }
-MODULES = {  # all that a pickle may name: the modules in which a name may be
-    "_reconstruct": ("numpy.core.multiarray", "numpy._core.multiarray"),
-    "scalar": ("numpy.core.multiarray", "numpy._core.multiarray"),
-    "_frombuffer": ("numpy.core.numeric", "numpy._core.numeric"),
-    "ndarray": ("numpy",),
-    "dtype": ("numpy",),
-    "csc_matrix": ("scipy.sparse.csc", "scipy.sparse._csc"),
-    "csr_matrix": ("scipy.sparse.csr", "scipy.sparse._csr"),
-    "Ch": ("chumpy.ch",),
-    "Select": ("chumpy.reordering",),
-    "_reconstructor": ("copy_reg", "copyreg"),
-    "object": ("__builtin__", "builtins"),
-    "encode": ("_codecs",),
-}
-STAND_INS = {name: type(name, (Inert,), {}) for name in MODULES}
+STAND_INS = {name: type(name, (Inert,), {}) for name in KNOWN}
 
 
 class InertUnpickler(pickle._Unpickler):
@@ -158,6 +150,6 @@ class InertUnpickler(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> type[Inert]:
         """The stand-in of a name; refuses any other name."""
-        if module not in MODULES.get(name, ()):
+        if module not in KNOWN.get(name, ())[1:]:
             raise pickle.UnpicklingError(f"refused {module}.{name}, which has no place in a file of arrays")
         return STAND_INS[name]

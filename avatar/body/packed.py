@@ -95,9 +95,15 @@ def joint_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[in
     return joints.astype(vertices.dtype)
 
 
-def write_template(path: Path, template: Template) -> None:
-    """Writes a body at rest as a ``template.npz``: sparse weights without loss, and joint positions."""
-    write_arrays(path, _template_arrays(template))
+def write_template(path: Path, template: Template, **others: np.ndarray) -> None:
+    """Writes a body at rest, and other arrays, as a ``template.npz``: weights without loss, and joint positions."""
+    ids, values = sparse_weights(template.weights.cpu().numpy())
+    given = {name: getattr(template, name) for name in ("canonical_from_bind", "uv", "uv_faces", "vertices", "faces")}
+    arrays = {name: value.cpu().numpy() for name, value in given.items() if value is not None}
+    arrays |= {name: arrays[name].astype(np.int32) for name in ("uv_faces", "faces") if name in arrays}
+    arrays |= {"weight_joints": ids, "weight_values": values, "joints": template.joints.cpu().numpy()}
+    arrays |= {"parents": np.array(template.parents, np.int32), "joint_names": np.array(template.joint_names)}
+    write_arrays(path, arrays | others)
 
 
 def read_template(path: Path) -> Template:
@@ -117,7 +123,7 @@ def write_body(path: Path, body: BodyModel) -> None:
     at_rest = body.with_canonical_pose(torch.zeros_like(body.canonical_pose)).template
     kept = {key: getattr(body, key) for key in (*BIND_KEYS, "pose_directions")}
     arrays = {key: value.cpu().numpy() for key, value in kept.items() if value is not None}
-    write_arrays(path, _template_arrays(at_rest) | arrays)
+    write_template(path, at_rest, **arrays)
 
 
 def packed_body(path: Path) -> BodyModel:
@@ -147,12 +153,12 @@ def packed_body(path: Path) -> BodyModel:
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
+def naming(path: Path, hint: str = "") -> Iterator[None]:
     """Errors within the block become `DataError` of a file; transforms that cannot be inverted are among them."""
     try:
         yield
     except (AvatarError, torch.linalg.LinAlgError) as error:
-        raise DataError(path, str(error)) from error
+        raise DataError(path, str(error).removeprefix(f"{path}: "), hint) from error
 
 
 def holds_template(path: Path) -> bool:
@@ -192,24 +198,6 @@ def _bind_of(at_rest: Template, zero_from_bind: Tensor | None) -> Template:
     )
 
 
-def _template_arrays(template: Template) -> dict[str, np.ndarray]:
-    """A template as the arrays of its file."""
-    ids, values = sparse_weights(template.weights.cpu().numpy())
-    given = {name: getattr(template, name) for name in ("canonical_from_bind", "uv", "uv_faces")}
-    arrays = {name: value.cpu().numpy() for name, value in given.items() if value is not None}
-    if "uv_faces" in arrays:
-        arrays["uv_faces"] = arrays["uv_faces"].astype(np.int32)
-    return arrays | {
-        "vertices": template.vertices.cpu().numpy(),
-        "faces": template.faces.cpu().numpy().astype(np.int32),
-        "weight_joints": ids,
-        "weight_values": values,
-        "joints": template.joints.cpu().numpy(),
-        "parents": np.array(template.parents, np.int32),
-        "joint_names": np.array(template.joint_names),
-    }
-
-
 def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.ndarray | None) -> Template:
     """A template of a file's arrays, with the vertices and joints of one of its poses."""
     parents = tuple(int(parent) for parent in arrays["parents"])
@@ -221,19 +209,15 @@ def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.nd
         raise AvatarError("weights: expected `weights`, or `weight_joints` and `weight_values`, got neither.")
     if joints is None:
         joints = joint_positions(vertices, weights, parents)
-    atlas = {key: arrays.get(key) for key in ("uv", "uv_faces")}
-    facts = {"parents": parents, "joint_names": arrays["joint_names"]}
-    return template_of(vertices=vertices, faces=arrays["faces"], weights=weights, joints=joints, **facts, **atlas)
+    kept = {key: arrays.get(key) for key in ("joint_names", "faces", "uv", "uv_faces")}
+    return template_of(parents, vertices=vertices, weights=weights, joints=joints, **kept)
 
 
 def template_of(parents: Iterable[int], joint_names: Iterable[str], **arrays: np.ndarray | None) -> Template:
     """A template of arrays by the names of its fields, float32."""
-    tensors = {
-        name: array if array is None else torch.from_numpy(array.astype(np.int64))
-        for name, array in arrays.items()
-        if name in ("faces", "uv_faces")
-    }
-    tensors |= {name: float32_tensor(array) for name, array in arrays.items() if name not in tensors}
+    whole = {name: arrays.pop(name) for name in ("faces", "uv_faces")}
+    tensors = {name: ids if ids is None else torch.from_numpy(ids.astype(np.int64)) for name, ids in whole.items()}
+    tensors |= {name: float32_tensor(array) for name, array in arrays.items()}
     return Template(parents=tuple(map(int, parents)), joint_names=tuple(map(str, joint_names)), **tensors)
 
 

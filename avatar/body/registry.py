@@ -48,11 +48,7 @@ class BodyConfig:
 
 
 def load_body(config: BodyConfig) -> BodyModel:
-    """The body a configuration names, float32.
-
-    Raises `AvatarError` for a shape or a setting that does not exist, naming those that do; `DataError` for a missing
-    or damaged file, with the way to a good one.
-    """
+    """The body a configuration names, float32; errors as in `open_body`, `anny_body`, `smpl_body`, `packed_body`."""
     body = BODIES[config.name](config)
     return body.with_canonical_pose(canonical_pose(config.canonical, body.joint_names))
 
@@ -70,10 +66,7 @@ def body_of_file(path: Path, settings: dict[str, Any], name: str = "") -> BodyMo
 
 
 def canonical_pose(name: str, joint_names: Sequence[str]) -> Tensor:
-    """A canonical pose by name, ``(J, 3)`` axis-angle: ``t``, or ``apart`` with both hips turned outwards.
-
-    Raises `AvatarError` for an unknown name, or a body without the joints it needs.
-    """
+    """A canonical pose of `CANONICAL_POSES`, ``(J, 3)`` axis-angle; `AvatarError` without the joints it needs."""
     if name not in CANONICAL_POSES:
         raise unknown_name("canonical pose", name, CANONICAL_POSES)
     pose = torch.zeros(len(joint_names), 3)

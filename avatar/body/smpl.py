@@ -110,23 +110,15 @@ def merge_weights(weights: np.ndarray, parents: Sequence[int], count: int) -> np
 
 def way_to_file(kind: str, path: Path | None = None) -> str:
     """Where a model is to be had, and the command that makes our file of it."""
-    return (
-        f"Download the {kind} model from {DOWNLOAD_PAGES[kind]} (its licence applies), then run: "
-        f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path)) if path else '<file.npz>'}"
-    )
+    line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path)) if path else '<file.npz>'}"
+    return f"Download the {kind} model from {DOWNLOAD_PAGES[kind]} (its licence applies), then run: {line}"
 
 
 def converted_kind(path: Path) -> str:
-    """The kind of model a converted file holds: smpl, smplh or smplx.
-
-    Raises `DataError` for a missing or damaged file, or one that tools/convert_body.py has not written.
-    """
-    try:
+    """The kind of model (smpl, smplh, smplx) that a file of tools/convert_body.py holds; `DataError` for any other."""
+    line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path))}"
+    with naming(path, f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"):
         return str(read_arrays(path, {"kind": "text 1"})["kind"][0])
-    except DataError as error:
-        line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path))}"
-        hint = f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"
-        raise DataError(path, str(error).removeprefix(f"{path}: "), hint) from error
 
 
 def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
@@ -134,10 +126,8 @@ def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
     hint = way_to_file(kind or "smplx", path)
     if not Path(path).is_file():
         raise DataError(path, f"expected a converted {kind or 'SMPL-family'} body model, there is no such file.", hint)
-    try:
+    with naming(path, hint):
         model = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
-    except DataError as error:
-        raise DataError(path, str(error).removeprefix(f"{path}: "), hint) from error
     stored = str(model["kind"][0])
     if kind not in (None, stored):
         raise DataError(path, f"expected a {kind} body model, got {stored}.", hint)

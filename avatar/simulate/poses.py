@@ -190,7 +190,11 @@ def clear_of_itself(poses: np.ndarray, clearance: float = CLEARANCE) -> np.ndarr
         normals = vertex_normals(posed, body.faces)
         for frame in np.flatnonzero(clear):
             points, outward = posed[frame].numpy(), normals[frame].numpy()
-            clear[frame] = not any(_touch(points, outward, *pair, clearance) for pair in pairs)
+            for mover, rest in pairs:
+                distance, nearest = build_tree(points[rest]).query(points[mover])
+                across = points[mover] - points[rest[nearest]]
+                behind = (across * outward[rest[nearest]]).sum(axis=1) < 0
+                clear[frame] &= not ((distance < clearance) | (behind & (distance < 0.15))).any()
     return clear
 
 
@@ -209,11 +213,3 @@ def _touching_parts(body: BodyModel) -> list[tuple[np.ndarray, np.ndarray]]:
         pairs.append((hand & sampled, ~hand & ~arm & sampled))
         shins.append(leg & below & sampled)
     return [(np.flatnonzero(mover), np.flatnonzero(rest)) for mover, rest in (*pairs, shins)]
-
-
-def _touch(points: np.ndarray, normals: np.ndarray, mover: np.ndarray, rest: np.ndarray, clearance: float) -> bool:
-    """Whether any mover vertex is within the clearance of, or behind, the surface of the rest."""
-    distance, nearest = build_tree(points[rest]).query(points[mover])
-    across = points[mover] - points[rest[nearest]]
-    behind = (across * normals[rest[nearest]]).sum(axis=1) < 0
-    return bool(((distance < clearance) | (behind & (distance < 0.15))).any())

@@ -47,23 +47,12 @@ log = logging.getLogger(__name__)
 Job = NamedPose | Motion  # a pose to settle in, or a sequence to play
 
 
-@dataclass(frozen=True)
-class Preset:
-    """How much is simulated: ``outfits``, settled frames a split, or continuous sequences a split instead."""
-
-    outfits: tuple[str, ...]
-    train: int = 0
-    test: int = 0
-    interpolation: int = 0
-    train_motions: tuple[str, ...] = ()
-    test_motions: tuple[str, ...] = ()
-
-
-PRESETS = {
-    "quick": Preset(("tee",), 32, 12, 8),
-    "sample": Preset(("tee", "dress"), 60, 20, 10),
-    "full": Preset(OUTFIT_NAMES, 300, 100, 50),
-    "motion": Preset(("tee", "dress"), train_motions=tuple(EVERYDAY), test_motions=tuple(SEQUENCES)),
+# How much is simulated: settled frames a split, or continuous sequences a split instead
+PRESETS: dict[str, dict[str, Any]] = {
+    "quick": {"outfits": ("tee",), "train": 32, "test": 12, "interpolation": 8},
+    "sample": {"outfits": ("tee", "dress"), "train": 60, "test": 20, "interpolation": 10},
+    "full": {"outfits": OUTFIT_NAMES, "train": 300, "test": 100, "interpolation": 50},
+    "motion": {"outfits": ("tee", "dress"), "train_motions": tuple(EVERYDAY), "test_motions": tuple(SEQUENCES)},
 }
 
 
@@ -112,9 +101,9 @@ class SimulateConfig:
 
 
 def asked(config: SimulateConfig, name: str) -> Any:
-    """A setting, or the preset's where it is left at None or empty."""
+    """A setting, or the preset's where it is left at None or empty; an empty one where the preset has none."""
     value = getattr(config, name)
-    return getattr(PRESETS[config.preset], name) if value in (None, []) else value
+    return PRESETS[config.preset].get(name, ()) if value in (None, []) else value
 
 
 def is_continuous(config: SimulateConfig) -> bool:

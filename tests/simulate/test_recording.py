@@ -56,10 +56,10 @@ def test_wrong_settings_say_what_is_right(changes, lists):
 
 
 def test_presets_are_as_promised():
-    assert len(PRESETS["quick"].outfits) == 1
-    assert [getattr(PRESETS["sample"], kind) for kind in KINDS] == [60, 20, 10]
-    assert (PRESETS["full"].train, PRESETS["full"].test) == (300, 100)
-    assert not set(PRESETS["motion"].train_motions) & set(PRESETS["motion"].test_motions)
+    assert len(PRESETS["quick"]["outfits"]) == 1
+    assert [PRESETS["sample"][kind] for kind in KINDS] == [60, 20, 10]
+    assert (PRESETS["full"]["train"], PRESETS["full"]["test"]) == (300, 100)
+    assert not set(PRESETS["motion"]["train_motions"]) & set(PRESETS["motion"]["test_motions"])
 
 
 def test_folders_tell_bodies_apart(tmp_path):
