@@ -87,12 +87,12 @@ def make_body() -> None:
     """
     parser = parser_of(make_body)
     parser.add_argument("target", type=path, help="the .npz to write")
-    for parameter in fields(declared("avatar.body.anny:Phenotype")):
+    for parameter in fields(declared("avatar.body.open:Phenotype")):
         parser.add_argument(f"--{parameter.name}", type=float, default=parameter.default)
     options = vars(parser.parse_args())
     target = options.pop("target")
 
-    from avatar.body.anny import Phenotype, anny_body
+    from avatar.body.open import Phenotype, anny_body
     from avatar.body.packed import write_body
 
     with refusals("make_body"):

@@ -11,9 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.body.anny import Phenotype, anny_body
 from avatar.body.model import BodyModel
-from avatar.body.open import open_body
+from avatar.body.open import Phenotype, anny_body, open_body
 from avatar.body.packed import holds_template, packed_body
 from avatar.body.smpl import DOWNLOAD_PAGES, converted_kind, smpl_body, way_to_file
 from avatar.checks import AvatarError, unknown_name
