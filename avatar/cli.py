@@ -200,11 +200,11 @@ def make_body() -> None:
 
     make_body data/bodies/tall.npz --height 0.9 --weight 0.7
     """
-    parameters = fields(declared("avatar.body.anny:Phenotype"))
+    parameters = fields(declared("avatar.body.open:Phenotype"))
     shape = {parameter.name: {"type": float, "default": parameter.default} for parameter in parameters}
     options = vars(parse(make_body, target=TARGET, **shape))
     target = options.pop("target")
-    from avatar.body.anny import Phenotype, anny_body
+    from avatar.body.open import Phenotype, anny_body
     from avatar.body.packed import write_body
 
     body = anny_body(Phenotype(**options))
@@ -223,7 +223,7 @@ def make_motion() -> None:
     seconds, fps = ({"type": float, "default": value} for value in (6.0, 30.0))
     options = parse(make_motion, name=name, target=TARGET, seconds=seconds, fps=fps)
     from avatar.io.motions import write_motion
-    from avatar.simulate.sequences import authored_motion
+    from avatar.simulate.angles import authored_motion
 
     motion = authored_motion(options.name, options.fps, options.seconds)
     write_motion(options.target, motion)

@@ -26,7 +26,7 @@ from avatar.data.layouts import open_outfit_folder
 from avatar.data.packed_layout import write_packed_outfit
 from avatar.io.frames import write_manifest
 from avatar.io.motions import write_motion
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 ROOT = Path(__file__).parents[1]
 PROGRAMS = "python|python3|torchrun|srun|sbatch|make|pip|apt-get|conda|docker|bash|sh"

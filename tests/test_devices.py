@@ -30,7 +30,7 @@ from avatar.pipeline.canonicalization import canonicalize
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.runs.training import fit_outfit, load_avatar
 from avatar.runs.training import train as train_run
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 pytestmark = pytest.mark.pretended
 UNET = {"levels": 3, "width": 4, "out_channels": 4}

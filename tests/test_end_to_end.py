@@ -26,7 +26,7 @@ from avatar.pipeline.experiments import DemoConfig, demo
 from avatar.pipeline.reporting import CompareConfig, compare
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 pytestmark = pytest.mark.slow
 METRICS = ["cd_point", "cd_pop", "normal_l1", "penetration_share"]

@@ -17,7 +17,7 @@ from avatar.cli import make_motion
 from avatar.io.motions import move_body, read_body_motion, read_motion, resample_motion, write_motion
 from avatar.io.npz import write_arrays
 from avatar.records import Motion, Template
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 
 @pytest.fixture(scope="module")

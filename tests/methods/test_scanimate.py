@@ -27,7 +27,7 @@ from avatar.runs.prediction import predict_frames
 from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_to_dict
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 from avatar.training.trainer import Trainer, read_log
 
 SETTINGS = {

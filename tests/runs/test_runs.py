@@ -24,7 +24,7 @@ from avatar.runs.prediction import predict_frames
 from avatar.runs.training import choose_weights, load_avatar, mean_template
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_from_dict
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 from avatar.training.trainer import Trainer, read_log
 
 POSE = ("pose_vertices", "vertices", "vertex_transforms", "joint_transforms")

@@ -21,7 +21,7 @@ from avatar.settings import settings_from_dict
 from avatar.simulate.dressing import TravelConfig
 from avatar.simulate.outfits import outfit
 from avatar.simulate.poses import draw_poses
-from avatar.simulate.production import dress
+from avatar.simulate.recording import dress
 from avatar.training.trainer import Trainer, to_device
 from benchmarks.avatars import sample_outfit
 from benchmarks.comparisons import Comparison, Job, Run, absence
