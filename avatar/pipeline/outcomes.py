@@ -12,10 +12,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from avatar.invocation import activation_line, command_line, interpreter, shorten
+from avatar.invocation import activation_line, command_line, interpreter, option, shorten
 from avatar.io.npz import write_whole
 from avatar.progress import WORK, in_words
-from avatar.values import option
 
 RESUMED = ("simulate", "canonicalize", "train", "predict", "evaluate", "mesh", "experiment")  # skip what is finished
 SPLITS = ("train", "test", "interpolation", "validation")

@@ -1,14 +1,12 @@
-"""The trainer of every method: stages, budget, bad steps, inputs, log, validation, checkpoints, signals, ranks."""
+"""The trainer of every method: stages, budget, bad steps, inputs, validation, checkpoints, signals, ranks."""
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from itertools import islice
 from pathlib import Path
 from typing import Protocol, Self
@@ -16,15 +14,15 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor, nn
 
-from avatar.checks import AvatarError, DataError, require
+from avatar.checks import AvatarError, DataError
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
-from avatar.io.npz import write_whole
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Task
 from avatar.methods.settings import Clock
 from avatar.nn.layers import synchronize_norms
 from avatar.progress import Progress
 from avatar.records import LossTerms, map_tensors
+from avatar.training.logs import TrainingLog
 from avatar.training.signals import StopRequest, stop_requests
 from avatar.world import average, broadcast, current_world, gather, gradients_of
 
@@ -276,46 +274,3 @@ class Feed:
 def to_device(records: Inputs, device: torch.device) -> Inputs:
     """Inputs with their tensors on a device; from pinned memory without waiting for the copy."""
     return tuple(map_tensors(record, lambda tensor: tensor.to(device, non_blocking=True)) for record in records)
-
-
-class TrainingLog:
-    """Rows of ``metrics.csv``, and of TensorBoard where it is installed: split, step, epoch, seconds and every term."""
-
-    def __init__(self, folder: Path, columns: list[str], from_step: int):
-        """Begins the log of a run, or drops rows past the step a resumed run starts from; `DataError` if it cannot."""
-        self.path = folder / "metrics.csv"
-        self.columns = ["split", "step", "epoch", "seconds", *columns]
-        kept = [row for row in read_log(self.path) if int(row["step"]) <= from_step] if self.path.is_file() else []
-        header = dict(zip(self.columns, self.columns))
-        write_whole(self.path, self.as_text(header, *kept).encode())
-        self.board = None
-        with suppress(AvatarError):
-            require("tensorboard")
-            self.board = require("torch.utils.tensorboard").SummaryWriter(folder / "tensorboard")
-
-    def as_text(self, *rows: dict[str, str]) -> str:
-        """Rows as lines of the file."""
-        text = io.StringIO(newline="")
-        csv.DictWriter(text, self.columns, restval="", extrasaction="ignore").writerows(rows)
-        return text.getvalue()
-
-    def write(self, split: str, step: int, epoch: int, seconds: float, values: dict[str, float]) -> None:
-        """Writes one row, of values there are. Raises `DataError` when the disk refuses."""
-        if not values:
-            return
-        row = {"split": split, "step": step, "epoch": epoch, "seconds": f"{seconds:.2f}"}
-        try:
-            with self.path.open("a", newline="") as file:
-                file.write(self.as_text(row | {name: f"{value:.6g}" for name, value in values.items()}))
-        except OSError as error:
-            hint = "Make room and give the same command again."
-            raise DataError(self.path, f"could not be written ({error.strerror}).", hint) from error
-        for name, value in values.items() if self.board else ():
-            self.board.add_scalar(f"{split}/{name}", value, step)
-
-
-def read_log(path: Path) -> list[dict[str, str]]:
-    """The whole rows of a training log; what a killed run left half-written is passed over."""
-    text = path.read_text(errors="replace")
-    rows = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
-    return [row for row in rows if str(row.get("step")).isdigit() and None not in (*row, *row.values())]

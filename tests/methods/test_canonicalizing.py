@@ -35,7 +35,8 @@ from avatar.methods.canonicalizer import (
 )
 from avatar.pipeline.canonicalization import canonicalize, canonicalizer_with, score_canonical_scans, weight_colors
 from avatar.runs.canonicalizing import canonicalize_frames, skinning_source, train_canonicalizer
-from avatar.training.trainer import Trainer, read_log
+from avatar.training.logs import read_log
+from avatar.training.trainer import Trainer
 
 TEMPLATE = arm_template()
 NETS = CanonicalizerConfig(SkinningFieldConfig(width=32, orders=4), SkinningFieldConfig(width=32, orders=4, latent=4))

@@ -29,7 +29,7 @@ from avatar.pipeline.surfaces import MeshConfig, mesh
 from avatar.records import LossTerms, Mesh, Surface
 from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
-from avatar.training.trainer import read_log
+from avatar.training.logs import read_log
 
 
 @dataclass

@@ -28,7 +28,8 @@ from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_to_dict
 from avatar.simulate.angles import authored_motion
-from avatar.training.trainer import Trainer, read_log
+from avatar.training.logs import read_log
+from avatar.training.trainer import Trainer
 
 SETTINGS = {
     "avatar": {

@@ -25,7 +25,8 @@ from avatar.runs.training import choose_weights, load_avatar, mean_template
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_from_dict
 from avatar.simulate.angles import authored_motion
-from avatar.training.trainer import Trainer, read_log
+from avatar.training.logs import read_log
+from avatar.training.trainer import Trainer
 
 POSE = ("pose_vertices", "vertices", "vertex_transforms", "joint_transforms")
 TENSORS = (*POSE, "scan_points", "scan_normals", "outfit_ids")

@@ -18,7 +18,7 @@ from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.nn.layers import synchronize_norms
 from avatar.runs.canonicalizing import train_canonicalizer
 from avatar.runs.training import train as train_run
-from avatar.training.trainer import read_log
+from avatar.training.logs import read_log
 from avatar.world import World, average, broadcast, current_world, gather, torchrun_world
 
 SCRIPT = Path(__file__).parent / "team.py"

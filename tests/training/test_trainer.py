@@ -21,8 +21,9 @@ from avatar.methods.closet import ClosetAvatar
 from avatar.methods.losses import TERMS, LossConfig, point_avatar_loss
 from avatar.methods.points import PointTask
 from avatar.methods.settings import Clock, Schedule, TrainConfig
+from avatar.training.logs import read_log
 from avatar.training.signals import Stopped
-from avatar.training.trainer import Trainer, read_log
+from avatar.training.trainer import Trainer
 
 
 def make_trainer(folder: Path, **options) -> Trainer:

@@ -13,7 +13,7 @@ from typing import Any
 
 from avatar.io.checkpoints import read_manifest
 from avatar.training import trainer
-from avatar.training.trainer import read_log
+from avatar.training.logs import read_log
 from reliability.corruption import digest, load_quietly
 from reliability.findings import Finding, all_of
 from reliability.small_jobs import JOBS, SAVE_EVERY, STEPS, folder_of, prepare, train_job, weights_digest
