@@ -5,13 +5,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from avatar.body.model import BodyModel
+from avatar.body.open import open_body
+from avatar.body.packed import packed_body
 from avatar.body.skinning import blend_transforms
-from avatar.checks import AvatarError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_finite, check_shape
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import axis_angle_from_rotation, rotation_from_axis_angle, transform_points
 from avatar.geometry.trees import build_tree
@@ -79,18 +82,31 @@ def pose_path(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
     return axis_angle_from_rotation(a @ rotation_from_axis_angle(eased[:, None, None] * turn)).float().numpy()
 
 
+def subject(shape: str) -> BodyModel:
+    """The open body in one of its shapes, or a body of its topology from a file of tools/make_body.py.
+
+    Raises `DataError` for a damaged file or a body of another topology.
+    """
+    if not shape.endswith(".npz"):
+        return open_body(shape)
+    body = packed_body(Path(shape))
+    if not torch.equal(body.faces, open_body().faces):
+        raise DataError(Path(shape), "faces: expected those of the open body.", "Make it with tools/make_body.py.")
+    return body
+
+
 class DressedBody:
     """A body in an outfit, with everything prepared that does not depend on the pose."""
 
-    def __init__(self, body: BodyModel, outfit: OutfitConfig, travel: TravelConfig | None = None):
+    def __init__(self, outfit: OutfitConfig, travel: TravelConfig | None = None):
         """Cuts the garments, settles them in the bind pose and keeps that as the start of every travel."""
-        self.body, self.outfit, self.travel = body, outfit, travel or TravelConfig()
-        self.garments = [cut_garment(body, config) for config in outfit.garments]
+        self.body, self.outfit, self.travel = subject(outfit.shape), outfit, travel or TravelConfig()
+        self.garments = [cut_garment(self.body, config) for config in outfit.garments]
         sizes = [len(g.vertices) for g in self.garments]
         self.offsets = np.concatenate([[0], np.cumsum(sizes)])
         self.faces = np.concatenate([g.faces + o for g, o in zip(self.garments, self.offsets)])
         self.labels = np.repeat(np.arange(1, len(sizes) + 1), sizes).astype(np.uint8)
-        self.start_pose = bind_pose(body)
+        self.start_pose = bind_pose(self.body)
         self.layers = self.make_layers()
         self.start = np.concatenate([g.vertices for g in self.garments])
         self.start = self.run(self.start_pose[None]).cloth

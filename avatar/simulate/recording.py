@@ -17,9 +17,8 @@ import torch
 import yaml
 
 from avatar import __version__
-from avatar.body.model import BodyModel
-from avatar.body.open import open_body, open_body_shapes
-from avatar.body.packed import packed_body, write_body
+from avatar.body.open import open_body_shapes
+from avatar.body.packed import write_body
 from avatar.checks import AvatarError, DataError, unknown_name
 from avatar.environment import prepared_process
 from avatar.io.frames import OpenGarment, read_open_frame, read_open_garment, write_manifest, write_open_garment
@@ -177,7 +176,7 @@ def simulate(config: SimulateConfig) -> list[FrameReport]:
     if config.history:
         poses = draw_poses(config.history + 1, config.seed, "test")
         for folder, clothes in dressed_outfits(config):
-            dressed = dress(clothes, config.travel)
+            dressed = DressedBody(clothes, config.travel)
             log.info("%s: %s", folder, history_error(dressed, poses))
             log.info("%s: %s", folder, pose_sensitivity(dressed, poses[:-1], seed=config.seed))
         return []
@@ -205,7 +204,7 @@ def simulate_outfit(
     """
     workers = config.workers or len(os.sched_getaffinity(0))
     with one_thread():
-        dressed = dress(outfit, config.travel)
+        dressed = DressedBody(outfit, config.travel)
         write_outfit(dressed, folder, config.gates)
         done = FrameLedger(folder, len(dressed.labels))
 
@@ -241,24 +240,6 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def dress(outfit: OutfitConfig, travel: TravelConfig) -> DressedBody:
-    """A body in an outfit."""
-    return DressedBody(subject(outfit.shape), outfit, travel)
-
-
-def subject(shape: str) -> BodyModel:
-    """The open body in one of its shapes, or a body of its topology from a file of tools/make_body.py.
-
-    Raises `DataError` for a damaged file or a body of another topology.
-    """
-    if not shape.endswith(".npz"):
-        return open_body(shape)
-    body = packed_body(Path(shape))
-    if not torch.equal(body.faces, open_body().faces):
-        raise DataError(Path(shape), "faces: expected those of the open body.", "Make it with tools/make_body.py.")
-    return body
-
-
 def record(dressed: DressedBody, gates: GateConfig, job: Job, folder: Path) -> list[FrameReport]:
     """Writes a settled frame, or all frames of a sequence, into a split's folder."""
     if isinstance(job, Motion):
@@ -272,7 +253,7 @@ _worker: list[Any] = []  # what a worker process keeps between frames: a dressed
 def _start_worker(outfit: OutfitConfig, travel: TravelConfig, gates: GateConfig) -> None:
     """Dresses the body once in a worker process, on one thread."""
     torch.set_num_threads(1)
-    _worker[:] = dress(outfit, travel), gates
+    _worker[:] = DressedBody(outfit, travel), gates
 
 
 def _record_in_worker(job: Job, folder: Path) -> list[FrameReport]:

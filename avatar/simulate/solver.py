@@ -31,63 +31,12 @@ class SolverConfig:
         check_positive(self)
 
 
-class Contacts:
-    """Contact with a moving triangle mesh and anchor springs, in the place of Style3D's own collision handler.
+class ClothSolver:
+    """One garment over a moving triangle mesh: newton's Style3D with a collision handler of its own, which this is.
 
     newton's handler treats a mesh as one penalty shape; this one adds smooth directions at edges, the fabric's
-    thickness, creeping friction, anchors, and a limit on each step that keeps vertices outside.
+    thickness, creeping friction, springs to anchors, and a limit on each step that keeps vertices outside.
     """
-
-    def __init__(self, points: np.ndarray, faces: np.ndarray, stiffness: np.ndarray, fabric, config: SolverConfig):
-        warp = require("warp")
-        self.mesh, self.fabric, self.config = warp_mesh(points, faces, moving=True), fabric, config
-        self.count, self.positions = len(stiffness), None
-        self.stiffness = warp.array(stiffness, dtype=float, device="cpu")
-        self.points, self.normals, self.drifts, self.anchors, self.products = (
-            vectors(np.zeros((self.count, 3))) for _ in range(5)
-        )
-        self.hessians = warp.zeros(self.count, dtype=warp.mat33, device="cpu")
-
-    def move(self, points: np.ndarray) -> None:
-        """Moves the mesh to new ``(V, 3)`` points; the way since the last call is what friction sees."""
-        points = np.asarray(points, np.float32)
-        self.mesh.velocities.assign(points - self.mesh.points.numpy())
-        self.mesh.points.assign(points)
-        self.mesh.refit()
-
-    def frame_begin(self, positions, velocities, step) -> None:
-        """Finds the contacts of a step (called by Style3D)."""
-        found = self.points, self.normals, self.drifts
-        run_kernel("find_contacts", self.count, self.mesh.id, positions, REACH, *found)
-
-    def accumulate_contact_force(self, step, iteration, state, _, __, forces, previous, ___=None) -> None:
-        """Adds forces and per-particle Hessians at the current iterate (called by Style3D)."""
-        self.positions = state.particle_q
-        found = self.points, self.normals, self.drifts, self.anchors, self.stiffness
-        numbers = self.fabric.thickness, self.fabric.friction, self.config.contact_stiffness, self.config.creep
-        run_kernel("push_apart", self.count, self.positions, previous, *found, *numbers, forces, self.hessians)
-
-    def contact_hessian_diagonal(self):
-        """The per-particle Hessians (called by Style3D)."""
-        return self.hessians
-
-    def hessian_multiply(self, values):
-        """Hessian times vectors (called by Style3D)."""
-        run_kernel("apply_hessian", self.count, self.hessians, values, self.products)
-        return self.products
-
-    def linear_iteration_end(self, steps) -> None:
-        """Limits a step to where no particle enters the mesh (called by Style3D)."""
-        thickness = self.fabric.thickness
-        run_kernel("keep_outside", self.count, self.positions, self.points, self.normals, thickness, steps)
-
-    def frame_end(self, positions, velocities, step) -> None:
-        """Stops the motion: momentum is kept by `ClothSolver.step` alone (called by Style3D)."""
-        velocities.zero_()
-
-
-class ClothSolver:
-    """One garment over one moving collider; a step moves the collider and lets the cloth follow."""
 
     def __init__(
         self,
@@ -108,14 +57,19 @@ class ClothSolver:
         check_shape("stiffness", stiffness, "V", V=dims["V"])
         check_finite("rest", rest)
         newton, warp = require("newton"), require("warp")
-        self.config = config = config or SolverConfig()
-        self.contacts = Contacts(collider_points, collider_faces, stiffness, fabric, config)
+        self.fabric, self.count, self.config = fabric, dims["V"], config or SolverConfig()
+        self.mesh, self.iterate = warp_mesh(collider_points, collider_faces, moving=True), None
+        self.stiffness = warp.array(stiffness, dtype=float, device="cpu")
+        self.points, self.normals, self.drifts, self.anchors, self.products = (
+            vectors(np.zeros((self.count, 3))) for _ in range(5)
+        )
+        self.hessians = warp.zeros(self.count, dtype=warp.mat33, device="cpu")
         with warp.ScopedDevice("cpu"), contextlib.redirect_stdout(io.StringIO()):
             model = build_model(newton, rest, faces, fabric)
             style = newton.solvers.SolverStyle3D
-            iterations = style.Config(iterations=config.iterations, linear_iterations=config.linear_iterations)
-            self.solver = style(model, config=iterations)
-            self.solver.collision = self.contacts
+            rounds = style.Config(iterations=self.config.iterations, linear_iterations=self.config.linear_iterations)
+            self.solver = style(model, config=rounds)
+            self.solver.collision = self
             self.now, self.next = model.state(), model.state()
             self.last = warp.clone(self.now.particle_q)
 
@@ -124,17 +78,17 @@ class ClothSolver:
         self.now.particle_q.assign(np.asarray(positions, np.float32))
         self.last.assign(self.now.particle_q)
         self.moved = np.zeros(len(positions))
-        self.contacts.move(collider_points)
-        self.contacts.mesh.velocities.zero_()
+        self.move(collider_points)
+        self.mesh.velocities.zero_()
 
     def step(self, collider_points: np.ndarray, anchors: np.ndarray, share: float = 1.0) -> None:
         """Moves the collider and its anchors and advances the cloth by a share of one step, at most all of it."""
-        count, momentum = self.contacts.count, self.config.momentum * share
-        self.contacts.move(collider_points)
-        self.contacts.anchors.assign(np.asarray(anchors, np.float32))
-        run_kernel("extrapolate", count, self.now.particle_q, self.last, momentum, LONGEST_WAY)
+        self.move(collider_points)
+        self.anchors.assign(np.asarray(anchors, np.float32))
+        momentum = self.config.momentum * share
+        run_kernel("extrapolate", self.count, self.now.particle_q, self.last, momentum, LONGEST_WAY)
         self.solver.step(self.now, self.next, None, None, self.config.step)
-        run_kernel("hold_back", count, self.next.particle_q, self.last, share)
+        run_kernel("hold_back", self.count, self.next.particle_q, self.last, share)
         self.now, self.next = self.next, self.now
         self.moved = np.linalg.norm(self.now.particle_q.numpy() - self.last.numpy(), axis=1)
 
@@ -142,6 +96,43 @@ class ClothSolver:
     def positions(self) -> np.ndarray:
         """Cloth vertices ``(V, 3)``, metres (a copy)."""
         return self.now.particle_q.numpy().copy()
+
+    def move(self, points: np.ndarray) -> None:
+        """Moves the collider to new ``(V, 3)`` points; the way since the last call is what friction sees."""
+        points = np.asarray(points, np.float32)
+        self.mesh.velocities.assign(points - self.mesh.points.numpy())
+        self.mesh.points.assign(points)
+        self.mesh.refit()
+
+    def frame_begin(self, positions, velocities, step) -> None:
+        """Finds the contacts of a step (called by Style3D)."""
+        found = self.points, self.normals, self.drifts
+        run_kernel("find_contacts", self.count, self.mesh.id, positions, REACH, *found)
+
+    def accumulate_contact_force(self, step, iteration, state, _, __, forces, previous, ___=None) -> None:
+        """Adds forces and per-particle Hessians at the current iterate (called by Style3D)."""
+        self.iterate = state.particle_q
+        found = self.points, self.normals, self.drifts, self.anchors, self.stiffness
+        numbers = self.fabric.thickness, self.fabric.friction, self.config.contact_stiffness, self.config.creep
+        run_kernel("push_apart", self.count, self.iterate, previous, *found, *numbers, forces, self.hessians)
+
+    def contact_hessian_diagonal(self):
+        """The per-particle Hessians (called by Style3D)."""
+        return self.hessians
+
+    def hessian_multiply(self, values):
+        """Hessian times vectors (called by Style3D)."""
+        run_kernel("apply_hessian", self.count, self.hessians, values, self.products)
+        return self.products
+
+    def linear_iteration_end(self, steps) -> None:
+        """Limits a step to where no particle enters the collider (called by Style3D)."""
+        thickness = self.fabric.thickness
+        run_kernel("keep_outside", self.count, self.iterate, self.points, self.normals, thickness, steps)
+
+    def frame_end(self, positions, velocities, step) -> None:
+        """Stops the motion: momentum is kept by `step` alone (called by Style3D)."""
+        velocities.zero_()
 
 
 def build_model(newton, rest: np.ndarray, faces: np.ndarray, fabric: FabricConfig):

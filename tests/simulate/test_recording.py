@@ -14,7 +14,7 @@ from avatar.checks import AvatarError, DataError
 from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, write_open_frame, write_open_garment
 from avatar.records import Motion
 from avatar.simulate import gates as gates_module
-from avatar.simulate.dressing import Rest, bind_pose, pose_path
+from avatar.simulate.dressing import Rest, bind_pose, pose_path, subject
 from avatar.simulate.gates import (
     GateConfig,
     frames_of,
@@ -34,7 +34,6 @@ from avatar.simulate.recording import (
     load_motion,
     settled_poses,
     spread_poses,
-    subject,
 )
 
 POSE = NamedPose("walk.00003", np.full((22, 3), 0.1, np.float32))

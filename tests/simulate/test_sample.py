@@ -53,12 +53,12 @@ def test_sample_meets_its_gates_when_measured_again(name):
 @pytest.mark.slow
 def test_simulator_makes_the_sample_again():
     pytest.importorskip("newton")
-    from avatar.simulate.dressing import TravelConfig
-    from avatar.simulate.recording import dress, one_thread
+    from avatar.simulate.dressing import DressedBody
+    from avatar.simulate.recording import one_thread
 
     path = next(path for path in sorted((SAMPLE / "dress" / "test").glob("bend.*.npz")))
     stored = read_open_frame(path)
     with one_thread():
-        rest = dress(outfit("dress"), TravelConfig()).settle(stored.pose)
+        rest = DressedBody(outfit("dress")).settle(stored.pose)
     distance = np.linalg.norm(rest.cloth - stored.cloth, axis=1)
     assert distance.mean() < 2e-3  # bytes agree on the machine that made it; last bits differ elsewhere

@@ -18,10 +18,9 @@ from avatar.implicit.networks import PosedSdf, SdfConfig
 from avatar.methods.canonicalizer import CanonicalizerTask, CycleConfig
 from avatar.records import Mesh, PointCloud
 from avatar.settings import settings_from_dict
-from avatar.simulate.dressing import TravelConfig
+from avatar.simulate.dressing import DressedBody, TravelConfig
 from avatar.simulate.outfits import outfit
 from avatar.simulate.poses import draw_poses
-from avatar.simulate.recording import dress
 from avatar.training.trainer import Trainer, to_device
 from benchmarks.avatars import sample_outfit
 from benchmarks.comparisons import Comparison, Job, Run, absence
@@ -103,7 +102,7 @@ def simulation_comparisons(job: Job) -> list[Comparison]:
     travel = TravelConfig(stride=0.3, hold=3, least_hold=1) if job.quick else TravelConfig()
 
     def prepare(name: str) -> Run:
-        dressed = dress(outfit(name), travel)
+        dressed = DressedBody(outfit(name), travel)
         pose = draw_poses(1, 0, "train")[0].pose
         return lambda: dressed.settle(pose).cloth
 
