@@ -109,7 +109,7 @@ def write_template(path: Path, template: Template, **others: np.ndarray) -> None
 def read_template(path: Path) -> Template:
     """The body at rest that a ``template.npz`` holds, float32; file and errors as in `packed_body`."""
     arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
-    with naming(path):
+    with data_errors(path):
         template = _template(arrays, arrays["vertices"], arrays.get("joints"))
         check_bind(template)
         return replace(template, canonical_from_bind=float32_tensor(arrays.get("canonical_from_bind")))
@@ -141,7 +141,7 @@ def packed_body(path: Path) -> BodyModel:
     arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
     bound = [key for key in BIND_KEYS if key in arrays]
     directions = float32_tensor(arrays.get("pose_directions"))
-    with naming(path):
+    with data_errors(path):
         if 0 < len(bound) < len(BIND_KEYS):
             raise AvatarError(f"bind pose: expected all of {', '.join(BIND_KEYS)} or none, got {', '.join(bound)}.")
         if bound:
@@ -153,7 +153,7 @@ def packed_body(path: Path) -> BodyModel:
 
 
 @contextmanager
-def naming(path: Path, hint: str = "") -> Iterator[None]:
+def data_errors(path: Path, hint: str = "") -> Iterator[None]:
     """Errors within the block become `DataError` of a file; transforms that cannot be inverted are among them."""
     try:
         yield

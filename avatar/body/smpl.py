@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avatar.body.inert_pickle import read_pickled_arrays
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
-from avatar.body.packed import add_atlas, atlas_arrays, float32_tensor, holds_template, naming, template_of
+from avatar.body.packed import add_atlas, atlas_arrays, data_errors, float32_tensor, holds_template, template_of
 from avatar.checks import AvatarError, DataError, check_finite, check_shape
 from avatar.geometry.uv import check_atlas
 from avatar.io.npz import read_arrays, write_arrays
@@ -96,7 +96,7 @@ def smpl_body(
         uv=model.get("uv"),
         uv_faces=model.get("uv_faces"),
     )
-    with naming(path):
+    with data_errors(path):
         return BodyModel(bind, None, canonical_pose, float32_tensor(posedirs))
 
 
@@ -117,7 +117,7 @@ def way_to_file(kind: str, path: Path | None = None) -> str:
 def converted_kind(path: Path) -> str:
     """The kind of model (smpl, smplh, smplx) that a file of tools/convert_body.py holds; `DataError` for any other."""
     line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path))}"
-    with naming(path, f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"):
+    with data_errors(path, f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"):
         return str(read_arrays(path, {"kind": "text 1"})["kind"][0])
 
 
@@ -126,7 +126,7 @@ def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
     hint = way_to_file(kind or "smplx", path)
     if not Path(path).is_file():
         raise DataError(path, f"expected a converted {kind or 'SMPL-family'} body model, there is no such file.", hint)
-    with naming(path, hint):
+    with data_errors(path, hint):
         model = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
     stored = str(model["kind"][0])
     if kind not in (None, stored):
@@ -161,7 +161,7 @@ def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> st
         return "packed"
     read = read_arrays if source.suffix == ".npz" else read_pickled_arrays
     arrays = read(source, SOURCE_KEYS, OPTIONAL_SOURCE_KEYS)
-    with naming(source):
+    with data_errors(source):
         plain = _plain_model(arrays if uv is None else {k: v for k, v in arrays.items() if k not in ("vt", "ft")})
     if uv is not None:
         plain |= atlas_arrays(uv, plain["faces"], len(plain["v_template"]))

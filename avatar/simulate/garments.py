@@ -134,7 +134,7 @@ def hanging_tube(cutting: Cutting, config: GarmentConfig, points: np.ndarray) ->
     start, end = cutting.height(config.drop), cutting.height(config.bottom) - PAD
     heights = np.arange(start, end, -0.01)
     feet = cutting.height(0.3) >= heights  # no part of what cloth hangs over
-    profile = np.where(feet[:, None], 0, cutting.profile(heights)) * (1, -1, 1)
+    profile = np.where(feet[:, None], 0, cutting.profile(heights)) * (1, -1, 1)  # so that all three grow downwards
     widest, back, front = np.maximum.accumulate(profile).T * np.array([[1], [-1], [1]])
     spread = config.ease + config.flare * (start - heights)
     at = [np.interp(-points[:, 1], -heights, row) for row in (widest + spread, back - spread, front + spread)]
