@@ -103,6 +103,7 @@ FEWER = {
     "closet1": ("method=pop,closet", "outfit=[tee,skirt]"),
     "closet3": ("method=pop,closet", "outfit=jacket"),
     "closet4": ("method=scale_global,csf,closet_pointnext", "outfit=jacket"),
+    "closet_pop": ("budget=steps", "outfit=skirt", "method=pop,closet", "train.seed=0"),
     "fractions": ("method=static", "split.train_fraction=1.0,0.5"),
     "loose": ("method=closet,closet_learned",),
     "normals": ("outfit=tee", "method=pop", "train.seed=0"),
