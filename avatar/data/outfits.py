@@ -16,7 +16,7 @@ import torch
 from avatar.body.model import BodyModel
 from avatar.checks import AvatarError, DataError, did_you_mean, sentences
 from avatar.data.folders import SPLITS, VALIDATION
-from avatar.data.validation import check_frame, check_pose, check_template
+from avatar.data.validation import check_frame, check_joints, check_pose, check_template
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Template
 
@@ -35,9 +35,10 @@ class Outfit(ABC):
 
     @cached_property
     def template(self) -> Template:
-        """The body at rest in its canonical pose, float32, checked (`check_template`)."""
+        """The body at rest in its canonical pose, float32, checked (`check_template`, `check_joints`)."""
         template = self._read_template()
         check_template(template, self.path)
+        check_joints(template, self.path)
         return template
 
     def frames(self, split: str) -> tuple[str, ...]:

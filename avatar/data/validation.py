@@ -48,7 +48,7 @@ TURNS = {  # where it should lie and where it does: what corrects it
 
 
 def check_template(template: Template, path: Path) -> None:
-    """Refuses a body at rest that does not stand upright in metres, y up, facing +z, with joints in its limbs.
+    """Refuses a body at rest that does not stand upright in metres, y up, facing +z.
 
     Raises `DataError` with the turn or the factor that would correct it.
     """
@@ -59,7 +59,6 @@ def check_template(template: Template, path: Path) -> None:
     if not low <= extents[1] <= high:
         problem = f"vertices: expected a body {low} to {high} m high, got {extents[1]:.4g} along y."
         raise DataError(path, problem, _unit_hint(float(extents[1])))
-    check_joints(template, path)
 
 
 def _check_axes(template: Template, path: Path) -> None:

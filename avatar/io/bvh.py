@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -69,8 +70,8 @@ def _expect(tokens: deque[str], *expected: str) -> None:
 
 
 def _read_hierarchy(tokens: deque[str]) -> list[_Joint]:
-    if (tokens[0], tokens[1]) != ("HIERARCHY", "ROOT"):
-        raise ValueError(f"it begins with {f'{tokens[0]} {tokens[1]}'!r}, not with HIERARCHY ROOT")
+    if (start := " ".join(islice(tokens, 2))) != "HIERARCHY ROOT":
+        raise ValueError(f"it begins with {start!r}, not with HIERARCHY ROOT")
     tokens.popleft()
     joints: list[_Joint] = []
     stack: list[_Joint | None] = []  # open blocks; None is an end site
