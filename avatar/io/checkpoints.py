@@ -64,7 +64,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
         reason = getattr(error.__cause__, "strerror", error.__cause__)
         needed = f"{reason}; {len(data):,} bytes needed, {free:,} free"
         problem = f"could not write a checkpoint ({needed}). The last one written: {kept}."
-        raise DataError(folder, problem, "Make room and give the same command again.") from error
+        raise DataError(folder, problem, "Free disk space and give the same command again.") from error
     listed = {kept["file"] for kept in (*entries["last"], entries.get("best", entry))}
     for path in (*folder.glob("step-*.pt"), *folder.glob(".*.tmp-*")):
         if path.name not in listed:

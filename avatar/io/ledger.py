@@ -80,7 +80,7 @@ class Ledger:
                     lines = lines if stream.read(1) == b"\n" else b"\n" + lines  # behind a half-written line
                 stream.write(lines)
         except OSError as error:
-            hint = "Make room and give the same command again."
+            hint = "Free disk space and give the same command again."
             raise DataError(self.path, f"could not be written ({error.strerror}).", hint) from error
         self._keep(entries)
         WORK["made"] += len(entries)

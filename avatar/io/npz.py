@@ -187,5 +187,5 @@ def write_whole(path: Path, data: bytes) -> None:
         finally:
             os.close(folder)
     except OSError as error:
-        hint = "Make room and give the same command again."
+        hint = "Free disk space and give the same command again."
         raise DataError(path, f"could not be written ({error.strerror}; {len(data):,} bytes).", hint) from error

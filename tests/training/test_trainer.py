@@ -13,7 +13,6 @@ import torch
 from spheres import TEMPLATE, random_batch, small_config
 
 from avatar.checks import AvatarError, DataError
-from avatar.io import npz
 from avatar.io.checkpoints import load_checkpoint
 from avatar.io.locks import HELD, lock_folder
 from avatar.methods import points
@@ -112,13 +111,13 @@ def test_a_full_disk_ends_training_with_the_last_checkpoint_sound(tmp_path, monk
     fit(make_trainer(tmp_path, steps=3))
     rows = (tmp_path / "metrics.csv").read_text()
 
-    def full(path, data):
-        if path.suffix == refused[-1]:
+    def full(part, target):
+        if target.suffix == refused[-1]:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(path, data)
+        return replace_file(part, target)
 
-    write, refused = npz._replace, []
-    monkeypatch.setattr(npz, "_replace", full)
+    replace_file, refused = Path.replace, []
+    monkeypatch.setattr(Path, "replace", full)
     for kind in (".pt", ".json", ".csv"):
         refused.append(kind)
         with pytest.raises(DataError, match="No space left"):
