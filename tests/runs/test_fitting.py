@@ -123,7 +123,7 @@ def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_pos
 
     codes = base.model.codes.detach()
     tight, start = (error(base, code) for code in (codes[0], codes.mean(dim=0)))
-    assert error(fitted, fitted.model.codes[0].detach()) < 0.7 * min(tight, start)
+    assert error(fitted, fitted.model.codes[0].detach()) < 0.75 * min(tight, start)
 
 
 def test_another_subject_s_field_is_not_fitted():
