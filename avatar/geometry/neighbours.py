@@ -144,20 +144,24 @@ def ball_query(centres: Tensor, points: Tensor, radius: float, k: int, ranks: Te
     """
     check_shape("centres", centres, "S 3")
     check_shape("points", points, "N 3")
-    reach = min(k, len(points))
     if ranks is not None:
-        tree = build_tree(points.double().cpu().numpy())
-        held = tree.query_ball_point(centres.double().cpu().numpy(), radius, return_length=True)
-        reach = min(max(k, int(held.max())), len(points))
+        return _ranked_ball_query(centres, points, radius, k, ranks)
+    reach = min(k, len(points))
     ids = k_nearest(centres[None], points[None], reach)[0]
     distances = (points[ids] - centres[:, None]).norm(dim=-1)
-    if ranks is not None:
-        keys = torch.where(distances <= radius, ranks[ids], torch.iinfo(torch.int64).max)
-        keys[:, 0] = -1
-        kept = keys.argsort(dim=1)[:, :k]
-        ids, distances = ids.gather(1, kept), distances.gather(1, kept)
     ids = torch.where(distances <= radius, ids, ids[:, :1])
-    return torch.cat([ids, ids[:, :1].expand(-1, k - ids.shape[1])], dim=1)
+    return torch.cat([ids, ids[:, :1].expand(-1, k - reach)], dim=1)
+
+
+def _ranked_ball_query(centres: Tensor, points: Tensor, radius: float, k: int, ranks: Tensor) -> Tensor:
+    groups, order = nearest(centres[None], points[None])[0, :, None].expand(-1, k).cpu().numpy().copy(), ranks.cpu()
+    tree = build_tree(points.double().cpu().numpy())
+    balls = tree.query_ball_point(centres.double().cpu().numpy(), radius, return_sorted=False)
+    for group, ball in zip(groups, balls):
+        others = np.setdiff1d(np.asarray(ball, np.int64), group[:1], assume_unique=True)
+        kept = others[order.numpy()[others].argsort()[: k - 1]]
+        group[1 : 1 + len(kept)] = kept
+    return torch.from_numpy(groups).to(points.device)
 
 
 def point_to_point(points: Tensor, anchors: Tensor) -> Tensor:

@@ -97,8 +97,8 @@ def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:
         expected = f"a finest level below the template's {count} vertices"
         raise AvatarError(f"points: expected {expected}, got {config.points[0]}.")
     levels, finer = nn.ModuleList(), positions.detach()
-    order = farthest_points(finer, min(2 * config.points[0], len(finer)))
-    ranks = torch.arange(len(order), len(order) + len(finer), device=order.device)  # then the others, as they come
+    order = farthest_points(finer, config.points[0])
+    ranks = torch.arange(len(order), len(order) + len(finer), device=order.device)  # of the others, as they come
     ranks[order] = torch.arange(len(order), device=order.device)
     for count, radius in zip(config.points, config.radii):
         levels.append(Level(finer, finer[order[:count]], radius, config.neighbours, ranks if config.spread else None))
