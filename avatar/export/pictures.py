@@ -7,10 +7,12 @@ drawn unlit by pyvista, so that a picture does not depend on a renderer's idea o
 from __future__ import annotations
 
 import ctypes
+import importlib
 import io
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -139,7 +141,13 @@ def draw(layers: list[tuple[Any, np.ndarray, str | None]], camera: Camera) -> np
 
 
 def load_pyvista() -> ModuleType:
-    """pyvista, once it is known that this machine can draw: VTK without a GL library ends the whole process."""
+    """pyvista, once it is known that this machine can draw: VTK without a GL library ends the whole process.
+
+    Mesa and triton each bring an LLVM, and loading triton's after VTK has drawn ends the process as well, whoever asks
+    for it (torch does for roma); so triton, where there is one, is loaded first.
+    """
+    with suppress(ImportError):
+        importlib.import_module("triton")
     if sys.platform == "linux":
         if not any(_loads(name) for name in GL_LIBRARIES):
             names, line = ", ".join(GL_LIBRARIES), install_line("pyvista")

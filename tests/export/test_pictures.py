@@ -1,5 +1,8 @@
 """Pictures: what is drawn where, in which colour, from which side."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import trimesh
@@ -180,3 +183,15 @@ def test_a_machine_without_gl_is_told_what_to_install(monkeypatch):
     monkeypatch.setattr(pictures, "GL_LIBRARIES", ("libnothing.so.1",))
     with pytest.raises(AvatarError, match="apt-get install"):
         render_points(box_cloud())
+
+
+def test_what_torch_loads_late_may_come_after_a_picture():
+    """Mesa's and triton's LLVM: the other way round the process ends by a signal."""
+    code = (
+        "import numpy as np; from avatar.export.pictures import render_points; from avatar.records import PointCloud\n"
+        "points = np.random.default_rng(0).normal(size=(50, 3)); normals = np.tile([0.0, 0.0, 1.0], (50, 1))\n"
+        "render_points(PointCloud(points, normals))\n"
+        "import roma; print('drawn')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout) == (0, "drawn\n"), done.stderr
