@@ -56,7 +56,7 @@ ONLY_IN = {  # package: the subpackages that may name it at all
     "open3d": {"export"},
     "newton": {"simulate"},
     "warp": {"simulate"},
-    "triton": {"geometry"},
+    "triton": {"geometry", "export"},  # in export: loaded before VTK
     "anny": {"body"},
     "smplx": set(),
 }
