@@ -115,7 +115,7 @@ def quote(text: str) -> str:
 
 
 def option(name: str, value: str | Path | Iterable[str | Path]) -> str:
-    """An option and its value as a word of a command line, which is read back as it is."""
+    """An option and its value as one argument of a command line, which is read back as it is."""
     single = isinstance(value, (str, Path))
     return f"{name}={quote(str(value))}" if single else f"{name}=[{','.join(quote(str(item)) for item in value)}]"
 

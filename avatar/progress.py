@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
@@ -30,10 +30,11 @@ class Progress:
     budget: float | None = None  # seconds of work after which it ends as well
     spent: float = 0.0  # seconds of it that were spent earlier
     silent: bool = False  # for processes other than the main one
+    clock: Callable[[], float] = time.monotonic  # whose seconds the budget counts
 
     def __post_init__(self):
         self.before, self.values, self.logged_count = self.done, "", -1
-        self.started = self.logged = time.monotonic()
+        self.started, self.logged = self.clock(), time.monotonic()
         watched = not self.silent and sys.stderr.isatty()
         self.bar = tqdm(total=self.total, initial=self.done, desc=self.what, unit=self.unit) if watched else None
 
@@ -50,7 +51,7 @@ class Progress:
     @property
     def seconds(self) -> float:
         """Seconds since it began."""
-        return time.monotonic() - self.started
+        return self.clock() - self.started
 
     def seconds_left(self) -> float:
         """Seconds until all is done or the budget is spent, whichever comes first; infinite while nothing is known."""

@@ -16,6 +16,7 @@ from avatar.records import Frame, Template
 
 BOX_MARGIN = 0.1  # of the box's longest side, added on every side: space for clothes around the body
 KNN = 6  # the paper's number of neighbours
+CHUNK = 20_000  # points whose neighbours' weights are held at once
 
 
 @dataclass
@@ -108,11 +109,15 @@ class BodyField(nn.Module):
         """Weights ``(M, J)`` of posed points ``(M, 3)`` in the frame's world, metres."""
         check_shape("points", points, "M 3")
         vertices, places = (torch.as_tensor(array).double() for array in (frame.body.vertices, points))
-        return self.blend(places[None], vertices, FixedPoints(vertices), 1e-18)[0].float().numpy()
+        search = FixedPoints(vertices)
+        parts = [self.blend(part[None], vertices, search, 1e-18)[0].float() for part in places.split(CHUNK)]
+        return torch.cat(parts).numpy()
 
     def blend(self, points: Tensor, vertices: Tensor, search: FixedPoints, least: float) -> Tensor:
         """Weights of points beside the body at ``vertices (V, 3)``; squared distances count as ``least`` or more."""
         ids = search.k_nearest(points.detach(), self.neighbours)
+        if self.neighbours == 1:
+            return self.weights[ids[..., 0]].to(points)
         squares = (points.unsqueeze(2) - vertices[ids]).square().sum(dim=-1)
         closeness = squares.clamp(min=least).rsqrt()
         closeness = closeness / closeness.sum(dim=-1, keepdim=True)

@@ -83,7 +83,7 @@ class Outfit(ABC):
     def frame_path(self, split: str, name: str) -> Path:
         """The file of one of the outfit's frames. Raises `AvatarError` for a name that is not among them."""
         names = self.frames(split)
-        if name not in names:
+        if name not in self._frame_sets.get(split, names):
             near = difflib.get_close_matches(name, names, n=3) or names[:3]
             raise AvatarError(f"frame: {self.name} has no {split} frame {name!r}; there are {', '.join(near)}, ...")
         return self.path / ("train" if split == VALIDATION else split) / f"{name}.npz"
@@ -140,6 +140,11 @@ class Outfit(ABC):
             split: tuple(sorted(p.stem for p in (self.path / split).glob("*.npz") if not p.name.startswith(".")))
             for split in SPLITS
         }
+
+    @cached_property
+    def _frame_sets(self) -> dict[str, frozenset[str]]:
+        """The same names for look-ups."""
+        return {split: frozenset(names) for split, names in self._listed.items()}
 
     @abstractmethod
     def _read_template(self) -> Template:

@@ -128,15 +128,16 @@ class PackedOutfit(Outfit):
                 posed = self.fit_pose(stored["pose"], (vertices - posed.vertices).mean(axis=0, dtype=np.float64))
         whole = _whole_transforms(stored, path) if "vtransf" in stored else None
         joint_transforms = self._joint_transforms(stored, posed, whole, path)
-        joints, bound = torch.from_numpy(joint_transforms), template.canonical_from_bind
-        skinned = skin_transforms(template.weights, joints[None], bound)[0].numpy()
+        joints, given = torch.from_numpy(joint_transforms), "joint_transforms" in stored
+        if given or (whole is None and posed is None):
+            skinned = skin_transforms(template.weights, joints[None], template.canonical_from_bind)[0].numpy()
         transforms = whole if whole is not None else skinned if posed is None else posed.vertex_transforms
         if vertices is None:
             vertices = _move(transforms, template)
         check_size(vertices, template, path)
         if posed is not None:
             check_posed(posed.vertices, vertices, "pose", template, path)
-        if "joint_transforms" in stored:
+        if given:
             check_posed(_move(skinned, template), vertices, "joint_transforms", template, path)
         if whole is not None:
             check_vertex_transforms(whole, template, vertices, path)

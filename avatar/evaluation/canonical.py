@@ -260,7 +260,7 @@ def score_canonicalization(
         made = {"made_by": ledger and {true: "", **(made_by or {})}[label]}
         memory = Memory(ledger, f"canonical {label.method}", outfit, split, SOURCE, **made)
         contenders.append(Contender(label, partial(compare, method), memory))
-    return score_frames(outfit, split, names, list(CANONICAL_METRICS.values()), contenders)
+    return score_frames(outfit, split, names, list(CANONICAL_METRICS.values()), contenders, partial=True)
 
 
 def canonical_surfaces(outfit: Outfit, split: str, name: str) -> dict[int, Mesh]:

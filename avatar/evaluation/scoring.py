@@ -253,10 +253,11 @@ def score_frames(
     metrics: Sequence[Metric],
     contenders: Sequence[Contender],
     motion: bool = False,
+    partial: bool = False,
 ) -> Scores:
     """Every metric of every frame of some contenders, frame by frame, and their means. Values that a memory knows are
-    not measured again; those that a frame does not have (NaN) are left out of the means. Errors are passed on with the
-    frame's name. ``motion`` measures metrics of sequences too.
+    not measured again; where they may be ``partial``, those that a frame does not have (not finite) are left out.
+    Errors are passed on with the frame's name. ``motion`` measures metrics of sequences too.
     """
     frames: list[FrameScore] = []
     found: dict[Label, dict[str, list[float]]] = {c.label: {m.name: [] for m in metrics} for c in contenders}
@@ -284,7 +285,7 @@ def score_frames(
                 values |= new
             counts[label].append(points)
             for metric, value in values.items():
-                if not math.isnan(value):
+                if math.isfinite(value) or not partial:
                     where = (outfit.name, label.method, label.variant, label.seed, name)
                     frames.append(FrameScore(*where, metric, value, label.split))
                     found[label][metric].append(value)

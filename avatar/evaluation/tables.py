@@ -296,7 +296,7 @@ def budget_table(rows: Sequence[Score]) -> Table:
         note = f"Equal time: {np.mean(minutes):.1f} minutes each."
     else:
         note = "Neither steps nor time were equal."
-    notes = (note, "Minutes are by the clock; jobs that share a machine slow each other down.")
+    notes = (note, "Minutes are those of the budget: by the wall clock, or of all threads (`train.clock=processor`).")
     return Table("training of one run", "method", ("steps", "minutes"), tuple(body), notes)
 
 

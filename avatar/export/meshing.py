@@ -13,6 +13,7 @@ nearest point is far. The surface is cut along the line between, through its tri
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -135,7 +136,7 @@ class PoissonMesher:
             answer = self._connection.recv()
             if isinstance(answer, str):
                 raise MeshingError(f"open3d: {answer}")
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError, pickle.UnpicklingError) as error:
             self._process.join(timeout=5)
             raise MeshingError(
                 f"the meshing process died (exit code {self._process.exitcode}) on {len(points)} points. Try a lower "
@@ -158,6 +159,7 @@ class PoissonMesher:
         far_end.close()
         try:
             if not self._connection.poll(START_TIMEOUT_S):
+                self.close()
                 raise MeshingError(f"the meshing process did not start within {START_TIMEOUT_S} s.")
             reason = self._connection.recv()
         except (EOFError, OSError) as error:

@@ -92,8 +92,11 @@ class FixedPoints:
 def try_fused(queries: Tensor, points: Tensor) -> Tensor | None:
     """`kernels.nearest_fused`; None, with one warning for each kind of error, where Triton is missing or fails.
 
-    It needs a C compiler, too. What fails once, such as for want of memory, is tried again at the next call.
+    It needs a C compiler, too. What fails once, such as for want of memory, is tried again at the next call; a package
+    that is not there is not looked for again.
     """
+    if WARNED & {"ImportError", "ModuleNotFoundError"}:
+        return None
     try:
         from avatar.geometry.kernels import nearest_fused
 

@@ -33,8 +33,9 @@ class ExtractionConfig:
     parts: int = 1  # connected parts kept, those of largest area; 0 keeps all
 
     def __post_init__(self):
-        check_range(self, "resolution", low=self.coarsest, high=2048)
-        check_range(self, "coarsest", low=4)
+        check_range(self, "resolution", low=4, high=2048)
+        if not 4 <= self.coarsest <= self.resolution:
+            raise AvatarError(f"coarsest: expected 4 to resolution={self.resolution}, got {self.coarsest}.")
         check_range(self, "lipschitz", above=0)
         check_range(self, "parts", low=0)
 

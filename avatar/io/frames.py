@@ -146,6 +146,7 @@ def read_open_garment(path: Path) -> OpenGarment:
 def _check_garment(garment: OpenGarment) -> None:
     check_faces(np.asarray(garment.faces), len(garment.canonical))
     labels = np.asarray(garment.labels)
+    check_shape("labels", labels, "V", V=len(garment.canonical))
     if labels.min() < 1 or labels.max() > len(garment.names):
         raise AvatarError(f"labels: expected 1 to {len(garment.names)}, one number for each of {garment.names}.")
 

@@ -94,14 +94,19 @@ def write_motion(path: Path, motion: Motion) -> None:
     write_described(path, MOTION_FORMAT, MOTION, {key: getattr(motion, key) for key in MOTION})
 
 
+def check_rate(fps: float) -> None:
+    """Raises `AvatarError` for a frame rate outside 1 to 1000, NaN included."""
+    low, high = FRAME_RATES
+    if not low <= fps <= high:
+        raise AvatarError(f"fps: expected {low:g} to {high:g} frames per second, got {fps}.")
+
+
 def resample_motion(motion: Motion, fps: float) -> Motion:
     """A motion at another frame rate: rotations along the shortest arcs, translations along lines.
 
     The last frame is the last that lies within the motion. Raises `AvatarError` for a rate outside 1 to 1000.
     """
-    low, high = FRAME_RATES
-    if not low <= fps <= high:
-        raise AvatarError(f"fps: expected {low:g} to {high:g} frames per second, got {fps}.")
+    check_rate(fps)
     last = len(motion.poses) - 1
     times = np.arange(int(np.floor(last * fps / motion.fps + 1e-6)) + 1) * motion.fps / fps
     before = np.minimum(times.astype(int), max(last - 1, 0))

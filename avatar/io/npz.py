@@ -98,7 +98,7 @@ def _read(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, key: str,
             _check_header(path, key, shape, dtype, kind, info.file_size - stream.tell())
             array = np.frombuffer(bytearray(stream.read()), dtype=dtype)
             array = array.reshape(shape, order="F" if fortran else "C")
-    except (*DAMAGED, DataError):
+    except (*DAMAGED, DataError, MemoryError):
         raise
     except Exception as error:  # numpy takes an array's header for Python and may raise what Python does
         raise DataError(path, f"{key}: expected a plain array, it is not one ({error}).") from error

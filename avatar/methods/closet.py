@@ -53,7 +53,7 @@ class PoseLocality(Enum):
 class ClosetConfig:
     """CloSET's switches and sizes; the defaults are the paper's method at full size."""
 
-    pose_encoder: PointNet2Config = field(default_factory=lambda: PointNet2Config(relative=True))
+    pose_encoder: PointNet2Config = field(default_factory=PointNet2Config)
     garment_encoder: PointNet2Config = field(default_factory=lambda: PointNet2Config(**FULL_GARMENT_ENCODER))
     garment_decoder: DecoderConfig = field(default_factory=DecoderConfig)
     pose_decoder: DecoderConfig = field(default_factory=DecoderConfig)
@@ -65,6 +65,7 @@ class ClosetConfig:
     template: bool = True  # explicit template decomposition (CloSET 3.2); False is the CSF ablation
     pose: bool = True  # the pose branch; False is the `static` floor: a garment template skinned by the body
     pose_noise: float = 0.0  # metres; noise on the pose encoder's input in training
+    relative: bool = True  # the pose encoder's first abstraction sees how features differ from a group's centre as well
     rest_vertices: bool = True  # the pose encoder sees the template's vertices as features beside the posed ones
     pose_locality: PoseLocality = PoseLocality.whole
     local_encoder: LocalPoseConfig = field(default_factory=LocalPoseConfig)  # instead of pose_encoder when kinematic
@@ -111,7 +112,8 @@ class ClosetAvatar(TemplateNetwork):
             if config.pose_locality is PoseLocality.kinematic:
                 self.pose_encoder = LocalPoseEncoder(template, config.local_encoder)
             else:
-                self.pose_encoder = encoder(template, 6 if config.rest_vertices else 3, config.pose_encoder)
+                channels_in = 6 if config.rest_vertices else 3
+                self.pose_encoder = encoder(template, channels_in, config.pose_encoder, config.relative)
             self.pose_decoder = ShapeDecoder(channels + self.pose_encoder.out_channels, config.pose_decoder)
 
     def skin_with(self, skinning: LearnedSkinning) -> None:
@@ -132,9 +134,9 @@ class ClosetAvatar(TemplateNetwork):
         features = self.garment_encoder(codes)
         return interpolate(torch.cat([features, codes], dim=-1) if self.config.code_skip else features, samples)
 
-    def decode_garment(self, codes: Tensor, garment: Tensor, samples: SurfaceSamples) -> Decoded:
+    def decode_garment(self, codes: Tensor, garment: Tensor, places: Tensor, samples: SurfaceSamples) -> Decoded:
         """As `TemplateNetwork.decode_garment`, with the free offsets added where there are some."""
-        decoded = super().decode_garment(codes, garment, samples)
+        decoded = super().decode_garment(codes, garment, places, samples)
         if not self.config.free_offsets:
             return decoded
         free = interpolate(codes[..., self.config.code_channels :], samples) * FREE_RATE
@@ -191,6 +193,10 @@ class Closet(PointMethod):
         return {"fields": [settings_to_dict(skin.config) for skin in model.skinning.fields]}
 
     def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> ClosetAvatar:
+        encoder = facts["config"]["method"]["settings"].get("garment_encoder", {})
+        if "spread" not in encoder.get("hierarchy", {}):  # groups are no part of the weights
+            problem = "expected in the settings of trained weights, got none: they are of an earlier version"
+            raise AvatarError(f"garment_encoder.hierarchy.spread: {problem}. Hint: train the run again.")
         model = super().rebuild(settings, template, outfits, facts, weights)
         if settings.skinning is Skinning.learned:
             box = torch.tensor([[-1.0], [1.0]]).expand(2, 3)  # the fields' sizes alone matter: their state is loaded

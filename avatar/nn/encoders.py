@@ -28,7 +28,6 @@ class PointNet2Config:
     hierarchy: HierarchyConfig = field(default_factory=HierarchyConfig)
     abstraction: tuple[tuple[int, ...], ...] = FULL_ABSTRACTION  # channels of each set abstraction, finest first
     propagation: tuple[tuple[int, ...], ...] = FULL_PROPAGATION  # channels of each feature propagation, coarsest first
-    relative: bool = False  # the first abstraction sees its features' differences to the centre's own as well
 
     def __post_init__(self):
         self.abstraction = tuple(map(tuple, self.abstraction))
@@ -77,16 +76,19 @@ class SurfaceEncoder(nn.Module):
     stage: Callable[[Level, int, tuple[int, ...], bool], nn.Module]
     has_stem = False
 
-    def __init__(self, template: Template, channels: int, config: PointNet2Config):
-        """Builds the encoder for one template and ``channels`` input features a vertex."""
+    def __init__(self, template: Template, channels: int, config: PointNet2Config, relative: bool = False):
+        """Builds the encoder for one template and ``channels`` input features a vertex.
+
+        With ``relative`` the first stage sees how features differ from those of a group's centre as well.
+        """
         super().__init__()
         self.channels, self.out_channels = channels, config.propagation[-1][-1]
         levels = build_levels(template.vertices, config.hierarchy)
         widths = [widths[-1] for widths in config.abstraction]
         self.stem = point_mlp((channels, widths[0]), WideLinear) if self.has_stem else nn.Identity()
         widths.insert(0, widths[0] if self.has_stem else channels)
-        relative = [config.relative, *[False] * len(levels)]
-        self.abstractions = nn.ModuleList(map(self.stage, levels, widths, config.abstraction, relative))
+        first = [relative, *[False] * len(levels)]
+        self.abstractions = nn.ModuleList(map(self.stage, levels, widths, config.abstraction, first))
         self.propagations, coarse = nn.ModuleList(), widths.pop()
         for level, mlp in zip(reversed(levels), config.propagation):
             self.propagations.append(FeaturePropagation(level, coarse, widths.pop(), mlp))

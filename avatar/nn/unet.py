@@ -28,12 +28,12 @@ class UNetConfig:
         check_range(self, "levels", low=SMOOTH_LEVELS)
         check_range(self, "width", "out_channels", low=1)
 
-    def check_map_size(self, *sizes: int) -> None:
-        """Refuses images whose pixels a side cannot be halved at every level, with an `AvatarError`."""
+    def check_map_size(self, *sizes: int, name: str = "map_size") -> None:
+        """Refuses images whose pixels a side cannot be halved at every level, with an `AvatarError` for ``name``."""
         parts = 2**self.levels
         if min(sizes) < 1 or any(size % parts for size in sizes):
-            needed = f"expected a multiple of {parts}, as pose_encoder.levels={self.levels} halvings need"
-            raise AvatarError(f"map_size: {needed}, got {' x '.join(map(str, sizes))}.")
+            needed = f"expected a multiple of {parts}, as the {self.levels} levels of pose_encoder.levels need"
+            raise AvatarError(f"{name}: {needed}, got {' x '.join(map(str, sizes))}.")
 
 
 class Doubling(nn.Module):
@@ -84,7 +84,7 @@ class UNet(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """``(B, C, H, W)`` to ``(B, C', H, W)``; raises `AvatarError` unless both are multiples of ``2 ** levels``."""
         dims = check_shape("image", image, "B C H W", C=self.channels)
-        self.config.check_map_size(dims["H"], dims["W"])
+        self.config.check_map_size(dims["H"], dims["W"], name="image")
         pyramid = []
         for down in self.downs:
             image = down(image)

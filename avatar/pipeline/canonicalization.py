@@ -104,8 +104,6 @@ def canonicalizer_with(config: CanonicalizeConfig, source: SkinningSource) -> Ca
     def unpose(frame: Frame) -> Canonicalized:
         weights = source.weights_of(frame.scan.points, frame)
         scan = canonicalize_scan(frame.scan, frame.body, weights, template, config.stretch)
-        if field is None:
-            return Canonicalized(scan, source.blend_weights(scan.points, template.vertices.numpy()))
         points = torch.from_numpy(scan.points)[None].to(next(field.buffers()).device)
         with torch.no_grad():
             return Canonicalized(scan, field(points)[0].cpu().numpy())

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, check_name
 from avatar.data.folders import SPLITS, VALIDATION
 from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import FLOORS, base_method, method_key
@@ -19,6 +19,7 @@ from avatar.evaluation.scoring import ScoreConfig
 from avatar.export.meshing import require_poisson
 from avatar.export.pictures import load_pyvista
 from avatar.implicit.extraction import ExtractionConfig
+from avatar.invocation import CONF
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole
 from avatar.methods.base import CANONICALIZER
@@ -71,6 +72,9 @@ class ExperimentConfig(JobConfig):
         known, splits = (*SPLITS, VALIDATION), self.compare.splits
         if unknown := set(splits) - set(known):
             raise AvatarError(f"compare.splits: expected some of {', '.join(known)}, got {', '.join(sorted(unknown))}.")
+        if unknown := set(self.one_seed) - {path.stem for path in (CONF / "method").glob("*.yaml")}:
+            raise AvatarError(f"one_seed: expected variants of conf/method, got {', '.join(sorted(unknown))}.")
+        check_name("compare.table", f"{self.compare.table}_{self.budget}")
         if VALIDATION in splits and not self.split.validation_share:
             raise AvatarError("split.validation_share: expected above 0, for compare.splits names validation.")
 
@@ -160,14 +164,14 @@ def demo(config: DemoConfig) -> Path:
 
 
 @prepared_process()
-def experiment(config: ExperimentConfig) -> Path:
+def experiment(config: ExperimentConfig) -> Path | list[Path]:
     """Canonicalizes where the method needs it, trains, predicts and scores; gives the run's folder. What is finished is
     not done again; what prediction, scores or pictures would refuse is refused before any work. A job that is left out
-    (``one_seed``) makes nothing.
+    (``one_seed``) makes nothing and gives an empty list.
     """
     if config.is_left_out:
         log.info("%s has seed 0 alone (one_seed): nothing to do.", config.method.variant)
-        return config.run.folder
+        return []
     is_main, makers = current_world().is_main, canonicalizers_of(config)
     for split in set(config.compare.splits) - {VALIDATION}:
         for outfit in config.outfits():
@@ -204,19 +208,23 @@ def canonicalizers_of(config: ExperimentConfig) -> list[CanonicalizeConfig]:
 
 def tabulate_experiment(configs: Sequence[ExperimentConfig]) -> Path:
     """The table of an experiment's finished jobs, in the form that its first one asks for; the path of its Markdown.
-    Jobs of several budgets have a table each, ``<table>_<budget>``, and the scores of all stand in ``<table>.csv``.
+    Jobs of several budgets have a table each, ``<table>_<budget>``; the path is then that of the scores of all,
+    ``<table>.csv``. Raises `AvatarError` where all jobs are left out.
     """
     groups: dict[str, list[ExperimentConfig]] = {}
     for config in configs:
         if not config.is_left_out:
             groups.setdefault(config.budget, []).append(config)
+    if not groups:
+        raise AvatarError("one_seed: expected a job of seed 0, got none to tabulate. Hint: add train.seed=0.")
     name = configs[0].compare.table
     tables = {budget: f"{name}_{budget}" if len(groups) > 1 else name for budget in groups}
     written = [tabulate_jobs(group, tables[budget]) for budget, group in groups.items()]
-    if len(groups) > 1:
-        scores = read_scores(*(path.with_suffix(".csv") for path in written))
-        write_scores(written[0].with_name(f"{name}.csv"), scores)
-    return written[0]
+    if len(groups) == 1:
+        return written[0]
+    path = written[0].with_name(f"{name}.csv")
+    write_scores(path, read_scores(*(table.with_suffix(".csv") for table in written)))
+    return path
 
 
 def tabulate_jobs(configs: Sequence[ExperimentConfig], table: str) -> Path:

@@ -97,7 +97,7 @@ def report(config: ReportConfig) -> Path:
     avatar = load_avatar(config.run)
     rows, settings = [], avatar.config
     splits, root = ("test", *sorted({*SPLITS, VALIDATION} - {"test"})), scored.floors_root(config.run, settings)
-    scores = gather_scores((*config.against, config.run), splits, root, complete=False)
+    scores = gather_scores((*config.against, config.run), splits, root, against=True)
     for outfit in scored.run_outfits(avatar, config.data_root):
         names = spaced_frames(list(outfit.frames(config.split)), config.frames)
         rows += [pose_pictures(config, avatar, outfit, name) for name in names]
@@ -131,24 +131,25 @@ def report(config: ReportConfig) -> Path:
     return write_report(config.run, content)
 
 
-def gather_scores(runs: Sequence[Path], splits: Sequence[str], root: Path, complete: bool = True) -> Scores:
+def gather_scores(runs: Sequence[Path], splits: Sequence[str], root: Path, against: bool = False) -> Scores:
     """The scores of runs, split by split, each behind the floors of its outfits below ``root``. Files that are missing
-    are left out unless all are to be ``complete``. Outfits of one name in several data sets are an `AvatarError`.
+    are left out of runs that a report sets ``against`` its own. Outfits of one name in several data sets are an
+    `AvatarError`.
     """
     found, datasets = Scores(), {}
     for split in splits:
         mine, floors = Scores(), Scores()
         for run in runs:
-            if complete or scored.scores_file(run, split).is_file():
+            if not against or scored.scores_file(run, split).is_file():
                 new = read_scores(scored.scores_file(run, split))
                 for row in new.rows:
                     datasets.setdefault(row.outfit, set()).add(row.dataset or dataset_of(run))
                 mine += new
         for outfit in sorted({row.outfit for row in mine.rows}):
             if len(datasets[outfit]) > 1:
-                several = ", ".join(sorted(datasets[outfit]))
+                name, several = "against" if against else "runs", ", ".join(sorted(datasets[outfit]))
                 raise AvatarError(
-                    f"runs: outfit {outfit!r} is in several data sets ({several}) and would share a row. "
+                    f"{name}: outfit {outfit!r} is in several data sets ({several}) and would share a row. "
                     "Compare one data set at a time."
                 )
             if split != VALIDATION:  # each run has held back frames of its own

@@ -293,8 +293,9 @@ def seam_table(tests: Sequence[SeamTest]) -> Table:
 
 def seam_differences(tests: Sequence[SeamTest], baseline: str) -> Table:
     """One outfit's tests less the baseline's at the same places, near seams and far, with intervals over frames."""
-    others = {name_of(test.label): test for test in tests}
-    base = others.pop(baseline)
+    names = [name_of(test.label) for test in tests]
+    base, others = tests[names.index(baseline)], [test for test, name in zip(tests, names) if name != baseline]
+    columns = tuple(name for name in names if name != baseline)
 
     def paired(test: SeamTest, places: Sequence[int]) -> Interval:
         """The mean over frames of what a run and the baseline differ by, over the points of some bands."""
@@ -307,7 +308,7 @@ def seam_differences(tests: Sequence[SeamTest], baseline: str) -> Table:
         unit, scale = SHOWN[UNITS[metric]]
         places = [place for place, key in enumerate(KEYS) if key.metric == metric]
         for where, mine in ((f"nearer than {near}", places[:1]), (f"farther than {near}", places[1:])):
-            intervals = [paired(test, mine) for test in others.values()]
+            intervals = [paired(test, mine) for test in others]
             body.append(interval_row(f"{metric}, {where} ({unit})", intervals, scale))
     note = f"Differences to {baseline} with 95% intervals: percentile bootstrap over frames, paired."
-    return Table(f"{base.outfit}: seams, difference", "where", tuple(others), tuple(body), (note,))
+    return Table(f"{base.outfit}: seams, difference", "where", columns, tuple(body), (note,))

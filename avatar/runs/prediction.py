@@ -77,14 +77,15 @@ def split_poses(outfit: Outfit, split: str) -> list[Pose]:
 
 def motion_poses(outfit: Outfit, motion: Motion) -> list[Pose]:
     """The poses of a motion's frames, which are named ``<motion>.<frame>``."""
-    check_shape("poses", motion.poses, "T J 3", J=len(outfit.posable_body().parents))
+    dims = check_shape("poses", motion.poses, "T J 3", J=len(outfit.posable_body().parents))
+    check_shape("translations", motion.translations, "T 3", T=dims["T"])
     return [
         Pose(
             f"{motion.name}.{frame:05d}",
             lambda pose=pose, translation=translation: outfit.fit_pose(pose, translation),
             digest_of([pose.tolist(), translation.tolist(), outfit.shared_digest]),
         )
-        for frame, (pose, translation) in enumerate(zip(motion.poses, motion.translations, strict=True))
+        for frame, (pose, translation) in enumerate(zip(motion.poses, motion.translations))
     ]
 
 

@@ -9,7 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.model import SMPL_JOINTS
 from avatar.checks import AvatarError, unknown_name
+from avatar.io.motions import check_rate
 from avatar.records import Motion
+
+LONGEST = 3600  # seconds of a motion
 
 # The degrees of freedom of a person, in degrees: least, at ease, most. Arms: 0 abduction hangs, 90 is the T-pose. The
 # pelvis tilts in everyday poses only: pose encoders see the body in its root frame, without the direction of gravity.
@@ -180,13 +183,22 @@ EVERYDAY: dict[str, dict[str, tuple[float, float]] | Callable[[Draw], Angles]] =
 }
 
 
+def check_timing(fps: float, seconds: float) -> None:
+    """Raises `AvatarError` for a frame rate or a length in seconds out of range, NaN included."""
+    check_rate(fps)
+    if not 0 <= seconds <= LONGEST:
+        raise AvatarError(f"seconds: expected 0 to {LONGEST}, got {seconds}.")
+
+
 def authored_motion(name: str, fps: float = 30.0, seconds: float = 6.0) -> Motion:
     """A continuous, looping motion of `SEQUENCES` as a person would make it, the pelvis in place.
 
-    What the open dataset is tested on. Raises `AvatarError` for an unknown name, or when no frame would result.
+    What the open dataset is tested on. Raises `AvatarError` for an unknown name, a rate or a length out of range, or
+    when no frame would result.
     """
     if name not in SEQUENCES:
         raise unknown_name("name", name, SEQUENCES)
+    check_timing(fps, seconds)
     frames = round(fps * seconds)
     if frames < 1:
         raise AvatarError(f"fps, seconds: expected at least one frame, got {fps} fps for {seconds} s.")

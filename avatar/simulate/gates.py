@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, check_range
 from avatar.io.frames import OpenFrame, write_open_frame
 from avatar.records import Motion
 from avatar.simulate.dressing import DressedBody
 from avatar.simulate.level_sets import mesh_edges
 from avatar.simulate.mesh_queries import penetration_depths, visible_faces
-from avatar.simulate.outfits import check_positive
 from avatar.simulate.poses import NamedPose
 
 STRIDES = (1.0, 0.6, 0.35)  # shares of the configured stride, tried in turn until a frame passes the gates
@@ -30,7 +29,7 @@ class GateConfig:
     speed: float = 1e-3  # m a step, 99th percentile of vertex ways when the frame is taken
 
     def __post_init__(self):
-        check_positive(self)
+        check_range(self, *vars(self), above=0)
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from avatar.checks import AvatarError, unknown_name
-
-
-def check_positive(settings: Any, *names: str) -> None:
-    """Refuses settings that are not positive, all of a dataclass's where none are named; `AvatarError` names them."""
-    for name in names or vars(settings):
-        if not getattr(settings, name) > 0:
-            raise AvatarError(f"{name}: expected a positive number, got {getattr(settings, name)}.")
 
 
 @dataclass

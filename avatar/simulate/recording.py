@@ -19,7 +19,7 @@ import yaml
 from avatar import __version__
 from avatar.body.open import open_body_shapes
 from avatar.body.packed import write_body
-from avatar.checks import AvatarError, DataError, unknown_name
+from avatar.checks import AvatarError, DataError, check_range, unknown_name
 from avatar.environment import prepared_process
 from avatar.io.frames import OpenGarment, read_open_frame, read_open_garment, write_manifest, write_open_garment
 from avatar.io.ledger import Ledger, digest_of, file_digest
@@ -28,7 +28,7 @@ from avatar.processes import in_workers
 from avatar.progress import tracked
 from avatar.records import Motion
 from avatar.settings import FileName
-from avatar.simulate.angles import EVERYDAY, SEQUENCES, authored_motion
+from avatar.simulate.angles import EVERYDAY, SEQUENCES, authored_motion, check_timing
 from avatar.simulate.dressing import DressedBody, TravelConfig, pose_path
 from avatar.simulate.gates import (
     FrameReport,
@@ -39,7 +39,7 @@ from avatar.simulate.gates import (
     record_frame,
     record_motion,
 )
-from avatar.simulate.outfits import DEFAULT_SHAPES, OUTFIT_NAMES, OutfitConfig, check_positive, outfit
+from avatar.simulate.outfits import DEFAULT_SHAPES, OUTFIT_NAMES, OutfitConfig, outfit
 from avatar.simulate.poses import KINDS, NamedPose, draw_poses, everyday_poses, split_distances
 
 log = logging.getLogger(__name__)
@@ -96,7 +96,8 @@ class SimulateConfig:
         for name in (*KINDS, "workers", "history"):
             if (getattr(self, name) or 0) < 0:
                 raise AvatarError(f"{name}: expected a number of at least 0, got {getattr(self, name)}.")
-        check_positive(self, "fps", "seconds")
+        check_range(self, "seconds", above=0)
+        check_timing(self.fps, self.seconds)
 
 
 def asked(config: SimulateConfig, name: str) -> Any:
@@ -126,6 +127,7 @@ def load_motion(source: str, fps: float, seconds: float, seed: int = 0) -> Motio
 
     An everyday sequence passes one drawn pose of its family a second.
     """
+    check_timing(fps, seconds)
     if source in SEQUENCES:
         return authored_motion(source, fps, seconds)
     if source in EVERYDAY:

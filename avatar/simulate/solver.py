@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar.checks import check_finite, check_shape, require
+from avatar.checks import check_finite, check_range, check_shape, require
 from avatar.simulate.mesh_queries import run_kernel, vectors, warp_mesh
-from avatar.simulate.outfits import FabricConfig, check_positive
+from avatar.simulate.outfits import FabricConfig
 
 LONGEST_WAY = 0.005  # metres a vertex may be moved on by momentum in one step
 REACH = 0.04  # metres within which the collider is looked for; far above what it moves in a step
@@ -28,7 +28,7 @@ class SolverConfig:
     creep: float = 1e-3  # m a step below which friction is viscous, so that cloth forgets how it came here
 
     def __post_init__(self):
-        check_positive(self)
+        check_range(self, *vars(self), above=0)
 
 
 class ClothSolver:

@@ -52,6 +52,9 @@ class Trainer:
         self.task, self.budget, self.folder, self.model = task, budget, folder, task.model
         self.device = next(self.model.parameters()).device
         self.world = current_world()
+        if budget.minutes and budget.clock is Clock.processor and self.device.type != "cpu":
+            hint = "train.clock=wall, with no other job on the machine."
+            raise AvatarError(f"train.clock: processor time leaves out the work of {self.device.type}. Hint: {hint}")
         if self.world.size > 1:
             synchronize_norms(self.model, task.replicated)
         kept = self.model.state_dict().keys()
@@ -79,30 +82,34 @@ class Trainer:
     def run(self, log: TrainingLog | None, stop: StopRequest) -> None:
         """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
         budget = self.budget
-        started = budget.clock.seconds() - self.seconds
-        limit = 60 * budget.minutes if budget.minutes else None
-        bar = Progress(self.task.label, budget.steps, "step", self.step, limit, self.seconds, silent=log is None)
+        clock = budget.clock.seconds
+        started, limit = clock() - self.seconds, 60 * budget.minutes if budget.minutes else None
+        bar = Progress(self.task.label, budget.steps, "step", self.step, limit, self.seconds, log is None, clock)
         with bar, Feed(self.task.inputs_at, budget.steps, self.device) as feed:
             while self.progress() < 1:
                 terms, rate, norm = self.train_step(feed(self.step))
                 self.step += 1
-                stopping = self.sync_clock(budget.clock.seconds() - started, stop)
+                stopping = self.sync_clock(clock() - started, stop)
                 bar.advance()
-                done, rows = self.progress() >= 1, {}
+                done, score = self.progress() >= 1, None
                 if self.step % budget.log_every == 0 or done:
                     values = self.world_mean(self.task.log_values(terms)) | {"lr": rate, "grad_norm": float(norm)}
                     bar.show(**self.task.shown(values))
-                    rows["train"] = values
+                    self.write(log, "train", values)
                 if self.step % budget.validate_every == 0 or done:
-                    rows["validation"] = self.validate()
-                for split, values in rows.items() if log else ():
-                    log.write(split, self.step, self.step * self.task.batch // self.task.frames, self.seconds, values)
-                score = rows.get("validation", {}).get(self.task.criterion)
+                    values = self.validate()
+                    score = values.get(self.task.criterion)
+                    self.write(log, "validation", values)
                 due = self.step % budget.save_every == 0 or score is not None
                 if (due and not self.bad_steps) or done or stopping:
                     self.save(score)
                 if stopping and not done:
                     stop.leave(self.folder)
+
+    def write(self, log: TrainingLog | None, split: str, values: dict[str, float]) -> None:
+        """Writes one row of the log on the main rank."""
+        if log:
+            log.write(split, self.step, self.step * self.task.batch // self.task.frames, self.seconds, values)
 
     def sync_clock(self, seconds: float, stop: StopRequest) -> bool:
         """Averages the elapsed time over all ranks; True if any rank received a stop signal."""
@@ -268,7 +275,12 @@ class Feed:
 
     def _prepare(self, step: int) -> Inputs:
         records = self.make(step)
-        return tuple(map_tensors(record, Tensor.pin_memory) for record in records) if self.pinned else records
+        return tuple(map_tensors(record, pin) for record in records) if self.pinned else records
+
+
+def pin(tensor: Tensor) -> Tensor:
+    """A CPU tensor in page-locked memory; others, such as constant samples on the device, as they are."""
+    return tensor.pin_memory() if tensor.device.type == "cpu" else tensor
 
 
 def to_device(records: Inputs, device: torch.device) -> Inputs:

@@ -88,8 +88,11 @@ def test_without_triton_nothing_is_tried_and_a_warning_says_so(monkeypatch, capl
     monkeypatch.setitem(sys.modules, "triton", None)
     monkeypatch.delitem(sys.modules, "avatar.geometry.kernels", raising=False)
     monkeypatch.setattr("avatar.geometry.neighbours.WARNED", set())
-    for _ in range(2):
-        assert try_fused(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3)) is None
+    assert try_fused(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3)) is None
+    kernels = ModuleType("avatar.geometry.kernels")
+    kernels.nearest_fused = lambda queries, points: pytest.fail("looked for again")
+    monkeypatch.setitem(sys.modules, kernels.__name__, kernels)
+    assert try_fused(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3)) is None
     assert len(caplog.records) == 1 and "slow way" in caplog.text and "triton" in caplog.text
 
 

@@ -24,7 +24,7 @@ def parameters(module: torch.nn.Module) -> int:
 def test_full_encoders_and_decoders_have_the_published_sizes():
     template = open_body().template
     assert parameters(PointNet2(template, 3, PointNet2Config())) == 10_243_136
-    assert parameters(PointNet2(template, 6, ClosetConfig().pose_encoder)) == 10_244_096
+    assert parameters(PointNet2(template, 6, ClosetConfig().pose_encoder, relative=True)) == 10_244_096
     assert parameters(PointNet2(template, 64, PointNet2Config(**FULL_GARMENT_ENCODER))) == 280_928
     assert [parameters(ShapeDecoder(c, DecoderConfig())) for c in (67, 131, 132)] == [567_046, 599_814, 600_326]
     assert ClosetConfig().code_channels == 64
@@ -73,7 +73,7 @@ def test_set_abstraction_equals_the_layer_applied_to_every_neighbour(differences
 
 
 def test_the_first_abstraction_alone_is_relative_and_groups_may_be_the_nearest_points():
-    encoder = PointNet2(sphere_template(), 3, PointNet2Config(SIZES, ((8,), (9,)), ((7,), (4,)), relative=True))
+    encoder = PointNet2(sphere_template(), 3, PointNet2Config(SIZES, ((8,), (9,)), ((7,), (4,))), relative=True)
     assert [layer.difference_layer is not None for layer in encoder.abstractions] == [True, False]
     points = sphere_template().vertices
     nearest = build_levels(points, replace(SIZES, radii=(0.8, 1.5), spread=False))[0]

@@ -125,9 +125,16 @@ def test_budgets_have_a_table_each_and_one_file_of_scores(jobs, tmp_path):
     longer = replace(jobs[1], train=replace(jobs[1].train, steps=5), compare=replace(jobs[1].compare, out=tmp_path))
     other = replace(longer, train=replace(longer.train, seed=1), one_seed=("closet",))
     experiment(longer)
-    assert not experiment(other).exists()
+    assert experiment(other) == [] and not other.run.folder.exists()
     shorter = [replace(job, compare=longer.compare) for job in jobs[:2]]
-    assert tabulate_experiment([*shorter, longer, other]) == tmp_path / "small_4steps.md"
+    assert tabulate_experiment([*shorter, longer, other]) == tmp_path / "small.csv"
+    assert "Equal steps: 4 each." in (tmp_path / "small_4steps.md").read_text()
+    with pytest.raises(AvatarError, match="one_seed: expected a job of seed 0"):
+        tabulate_experiment([other])
+    with pytest.raises(AvatarError, match="one_seed: expected variants of conf/method, got clsoet"):
+        replace(other, one_seed=("clsoet",))
+    with pytest.raises(AvatarError, match=r"compare\.table: expected a plain name"):
+        replace(other, compare=replace(other.compare, table="a" * 60))
     assert "Equal steps: 5 each." in (tmp_path / "small_5steps.md").read_text()
     rows = [row for row in read_scores(tmp_path / "small.csv").rows if row.method == "closet"]
     assert {(row.table, row.steps) for row in rows} == {("small_4steps", 4), ("small_5steps", 5)}

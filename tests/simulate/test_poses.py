@@ -178,6 +178,10 @@ def test_poses_that_touch_themselves_are_found():
         (lambda: draw_poses(10_000, 0, "test"), "count: expected at most"),
         (lambda: authored_motion("fly"), "name: expected one of walk"),
         (lambda: authored_motion("walk", 30, 0), "at least one frame"),
+        (lambda: authored_motion("walk", 1e9), r"fps: expected 1 to 1000 frames per second, got 1000000000\.0"),
+        (lambda: authored_motion("walk", float("nan")), "fps: expected 1 to 1000 frames per second, got nan"),
+        (lambda: authored_motion("walk", 30, 1e9), r"seconds: expected 0 to 3600, got 1000000000\.0"),
+        (lambda: authored_motion("walk", 30, float("nan")), "seconds: expected 0 to 3600, got nan"),
     ],
 )
 def test_bad_requests_are_refused(call, message):

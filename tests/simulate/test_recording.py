@@ -46,7 +46,10 @@ POSE = NamedPose("walk.00003", np.full((22, 3), 0.1, np.float32))
         ({"outfits": ["tee", "tuxedo"]}, "tee, shirt, skirt, dress, jacket, coat"),
         ({"shapes": ["neutral"]}, "female"),
         ({"train": -1}, "at least 0"),
-        ({"fps": 0.0}, "positive"),
+        ({"fps": 0.0}, "fps: expected 1 to 1000"),
+        ({"fps": float("nan")}, "fps: expected 1 to 1000"),
+        ({"seconds": 0.0}, "seconds: expected above 0"),
+        ({"seconds": 1e9}, "seconds: expected 0 to 3600"),
     ],
 )
 def test_wrong_settings_say_what_is_right(changes, lists):
@@ -176,8 +179,8 @@ def test_stretch_is_measured_in_rest_lengths():
 
 def test_history_error_compares_both_ways():
     dressed = fake_dressed([0.0, 0.003])
-    told = "5.20 mm mean, 5.20 mm at the 95th percentile, 1 poses reached two ways"  # 3 mm along each axis
-    assert history_error(dressed, [POSE, POSE]) == f"history error {told}"
+    shown = "5.20 mm mean, 5.20 mm at the 95th percentile, 1 poses reached two ways"  # 3 mm along each axis
+    assert history_error(dressed, [POSE, POSE]) == f"history error {shown}"
     assert [via for _, via in dressed.calls] == [0, 1]
     with pytest.raises(AvatarError, match="at least 2"):
         history_error(dressed, [POSE])

@@ -46,6 +46,16 @@ def test_inputs_are_those_of_their_step_wherever_one_begins(elsewhere):
         assert [feed(step)[1].values.item() for step in (3, 3, 0, 7)] == [3, 3, 0, 7]
 
 
+def test_for_cuda_tensors_of_the_cpu_are_pinned_and_those_on_the_device_are_not(monkeypatch):
+    pinned = []
+    monkeypatch.setattr(Tensor, "pin_memory", lambda tensor: pinned.append(tensor) or tensor)
+    mine, there = torch.zeros(3), torch.zeros(3, device="meta")  # torch refuses to pin the second
+    feed = Feed(lambda step: (Numbers(mine, "mine"), Numbers(there, "there")), 2, CPU)
+    feed.pinned = True
+    first, second = feed._prepare(0)
+    assert len(pinned) == 1 and pinned[0] is mine and (first.values is mine, second.values is there) == (True, True)
+
+
 def test_on_the_cpu_no_thread_is_begun():
     """A second thread with tensor work halves the patience of OpenMP's idle threads, and with it the speed of steps."""
     seen = []
