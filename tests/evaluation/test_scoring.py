@@ -1,13 +1,16 @@
 """Scoring of folders: values, means, errors that name frames, and what is drawn from scans."""
 
 import logging
+import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from avatar.checks import AvatarError, DataError
-from avatar.evaluation.scoring import Label, ScoreConfig, draw_scan, score_predictions
+from avatar.evaluation.metrics import find_metrics
+from avatar.evaluation.scoring import Contender, Label, Memory, ScoreConfig, draw_scan, score_frames, score_predictions
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
 from avatar.records import Mesh, PointCloud
@@ -84,6 +87,21 @@ def test_error_in_a_metric_names_the_frame(ball, predictions, sphere_cloud):
     write_points(predictions / "walk.0000.ply", PointCloud(points, normals))
     with pytest.raises(AvatarError, match=r"ball, closet, frame walk\.0000.*more than 5 points"):
         score_predictions(predictions, ball, "test", ScoreConfig(metrics=["uniformity"]), Label("closet"))
+
+
+def test_a_value_that_is_not_finite_is_seen_in_the_mean_and_left_out_where_values_are_partial(ball):
+    metric = replace(find_metrics(["cd_point"])[0], measure=lambda seen: seen.value)
+    memory = Memory(None, "closet", ball, "test")
+
+    def compare(frame):
+        return SimpleNamespace(value=math.inf if frame.name == "walk.0001" else 1.0, points=frame.scan.points)
+
+    def score(partial):
+        contenders = [Contender(Label("closet"), compare, memory)]
+        (row,) = score_frames(ball, "test", ball.names, [metric], contenders, partial=partial).rows
+        return row.value, row.frames
+
+    assert score(partial=False) == (math.inf, 4) and score(partial=True) == (1.0, 3)
 
 
 def test_unknown_metric_and_bad_counts_are_refused_at_once():

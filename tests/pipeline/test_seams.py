@@ -172,6 +172,9 @@ def test_tables_and_differences_are_at_the_same_places():
     assert near.values == pytest.approx((3,), rel=0.02)
     assert near.cells[0].startswith("+") and "[+2" in near.cells[0] and "+4" in near.cells[0]
     assert abs(rows["distance, farther than 1 cm (mm)"].values[0]) < 0.1
+    several = seam_differences([csf, pop, probe("pop", 0.0, (0.002, 0.002))], "csf")
+    assert several.columns == ("pop", "pop")
+    assert several.rows[0].values == pytest.approx((3, 1), rel=0.02)
 
 
 def test_rows_are_tidy():

@@ -181,6 +181,10 @@ def test_processor_time_does_not_pass_while_others_work(tmp_path):
     used = Clock.processor.seconds()
     fit(trainer)
     assert 0.6 <= trainer.seconds <= Clock.processor.seconds() - used
+    trainer.model.to("meta")  # another device, whose work processor time leaves out
+    with pytest.raises(AvatarError, match=r"train\.clock: .* leaves out the work of meta\. Hint: train\.clock=wall"):
+        Trainer(trainer.task, trainer.budget, tmp_path)
+    Trainer(trainer.task, replace(trainer.budget, clock=Clock.wall), tmp_path)
 
 
 def test_rates_follow_their_schedule(tmp_path):
