@@ -19,27 +19,14 @@ from avatar.evaluation.metrics import Comparison, find_metrics
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.meshes import write_mesh
-from avatar.io.motions import read_body_motion
+from avatar.io.motions import move_body, read_body_motion
 from avatar.io.points import write_points
-from avatar.io.retargeting import move_body
 from avatar.methods.settings import RunConfig
 from avatar.records import Mesh, Motion, PointCloud, Scan, Surface
 from avatar.runs.training import load_avatar, train
 
-__all__ = [
-    "Avatar",
-    "Mesh",
-    "Motion",
-    "PointCloud",
-    "RunConfig",
-    "Surface",
-    "run_settings",
-    "score",
-    "to_mesh",
-    "train",
-    "write_mesh",
-    "write_points",
-]
+__all__ = ["Avatar", "Mesh", "Motion", "PointCloud", "RunConfig", "Surface", "run_settings", "score", "to_mesh"]
+__all__ += ["train", "write_mesh", "write_points"]
 METRICS = ("cd_point", "normal_l1_mean", "f_score_5mm")
 
 
@@ -49,16 +36,10 @@ class Avatar:
     def __init__(
         self, run: Path | str, data_root: Path | str | None = None, checkpoint: str = "last", device: str = "auto"
     ):
-        """Loads a run's avatar.
+        """Loads the avatar in a run's folder, its ``checkpoint`` ``last`` or ``best``, for ``auto``, ``cpu``, ``cuda``.
 
-        Args:
-            run: the run's folder.
-            data_root: where the data are now; where they were at training if None.
-            checkpoint: ``last`` or ``best``.
-            device: ``auto``, ``cpu``, ``cuda``.
-
-        Raises:
-            DataError: when the folder is no finished run, or a file in it is damaged.
+        ``data_root`` is where the data are now; where they were at training if None. Raises `DataError` when the folder
+        is no finished run, or a file in it is damaged.
         """
         self.trained = load_avatar(Path(run), checkpoint, device)
         config = self.trained.config
@@ -81,18 +62,11 @@ class Avatar:
         points: int = 50_000,
         surface: ExtractionConfig | None = None,
     ) -> Surface:
-        """The dressed surface in one pose.
+        """The dressed surface of an outfit, the first if None, in one pose.
 
-        Args:
-            pose: ``(J, 3)`` axis-angle, radians.
-            translation: ``(3,)`` metres.
-            outfit: one of `outfits`; the first if None.
-            points: points, 1,000 to 400,000.
-            surface: resolution of an implicit avatar's surface.
-
-        Raises:
-            AvatarError: for an unknown outfit, or a pose of other joints.
-            DataError: for an outfit whose body cannot be posed.
+        ``pose (J, 3)`` axis-angle, radians; ``translation (3,)`` metres; 1,000 to 400,000 ``points``; ``surface`` the
+        resolution of an implicit avatar's. Raises `AvatarError` for an unknown outfit, or a pose of other joints;
+        `DataError` for an outfit whose body cannot be posed.
         """
         pose, translation = np.asarray(pose, np.float32)[None], np.asarray(translation, np.float32)[None]
         return next(self.animate(Motion(pose, translation, 30.0, "pose"), outfit, points=points, surface=surface))
@@ -105,15 +79,11 @@ class Avatar:
         points: int = 50_000,
         surface: ExtractionConfig | None = None,
     ) -> Iterator[Surface]:
-        """The dressed surface in every frame of a motion, one after another.
+        """The dressed surface in every frame of a motion, one after another; see `pose`.
 
-        Args:
-            motion: an AMASS ``.npz``, a BVH file, one of our own, or arrays: of the body's own J joints, or of the 22
-                of SMPL, whose rotations then go to the joints of those names.
-            outfit: one of `outfits`; the first if None.
-            fps: frames a second that a file is resampled to; its own if None.
-            points: points a frame; those of a point method keep their order over time.
-            surface: resolution of an implicit avatar's surface.
+        A motion is an AMASS ``.npz``, a BVH file, one of our own, or arrays: of the body's own J joints, or of the 22
+        of SMPL, whose rotations then go to the joints of those names. A file is resampled to ``fps`` frames a second,
+        its own if None. The points of a point method keep their order over time.
         """
         data = self._find(outfit)
         body = data.posable_body()
@@ -150,23 +120,18 @@ class Avatar:
 def run_settings(*options: str) -> RunConfig:
     """Settings of a training run as the command line composes them from options such as ``"method=pop"``.
 
-    Paths may have any letters, as there.
-
-    Raises:
-        AvatarError: for unknown options, naming the nearest, and values out of range.
+    Raises `AvatarError` for unknown options, naming the nearest, and values out of range.
     """
-    from avatar.config import compose_run  # hydra, which is not needed to load and pose an avatar
+    from avatar.config import compose_settings  # hydra, which is not needed to load and pose an avatar
 
-    return compose_run(list(options))
+    return compose_settings("train", *options)
 
 
 def to_mesh(surface: Surface | PointCloud, config: PoissonConfig | None = None) -> Mesh:
     """The mesh of a surface: its own where the method has one, else Poisson reconstruction of its points.
 
-    As it starts a process, a script needs the usual ``if __name__ == "__main__":``.
-
-    Raises:
-        AvatarError: for points that cannot be meshed, and without open3d, naming what to install.
+    As it starts a process, a script needs the usual ``if __name__ == "__main__":``. Raises `AvatarError` for points
+    that cannot be meshed, and without open3d, naming what to install.
     """
     if isinstance(surface, Surface) and surface.mesh is not None:
         return surface.mesh
@@ -179,9 +144,8 @@ def score(
 ) -> dict[str, float]:
     """Metrics of one predicted surface against a true one, by name, in their units (`evaluation.metrics.METRICS`).
 
-    Raises:
-        AvatarError: for an unknown metric, one that needs a body, a sequence or a mesh that is not there, or points
-            that are not finite.
+    Raises `AvatarError` for an unknown metric, one that needs a body, a sequence or a mesh that is not there, or points
+    that are not finite.
     """
     cloud, mesh = (prediction.cloud, prediction.mesh) if isinstance(prediction, Surface) else (prediction, None)
     found = find_metrics(tuple(metrics))

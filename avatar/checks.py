@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -63,24 +64,18 @@ def nearest_folder(path: Path) -> str:
 
 
 def check_name(what: str, name: str) -> str:
-    """A name that may become a file or a folder: it stays where it is put. Gives it back.
+    """The name again, if it may become a file or a folder that stays where it is put.
 
-    Raises:
-        AvatarError: for any other: with slashes, drives, control characters or blanks, hidden, empty, too long.
+    Raises `AvatarError` for one with slashes, drives, control characters or blanks, hidden, empty, too long.
     """
     if not isinstance(name, str) or not SAFE_NAME.fullmatch(name):
-        raise AvatarError(
-            f"{what}: expected a plain name (letters, digits, '_', '.', '-', at most 64), got {name!r:.200}."
-        )
+        form = "a plain name (letters, digits, '_', '.', '-', at most 64)"
+        raise AvatarError(f"{what}: expected {form}, got {name!r:.200}.")
     return name
 
 
 def check_trained(path: Path) -> tuple[Path, Path]:
-    """The files of a run's weights and of their description, of which ``path`` lacks the endings.
-
-    Raises:
-        DataError: for one that is not there.
-    """
+    """The files of weights and of their description, ``path`` with two endings; raises `DataError` without one."""
     files = path.with_suffix(".safetensors"), path.with_suffix(".json")
     for file in files:
         if not file.is_file():
@@ -93,42 +88,44 @@ def plain_name(text: str, otherwise: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).lstrip("_.-")[:64] or otherwise
 
 
+def check_range(
+    settings: Any, *names: str, low: float = -math.inf, above: float = -math.inf, high: float = math.inf
+) -> None:
+    """Refuses settings of which a named field is below ``low``, not ``above`` a number or beyond ``high``.
+
+    None, which stands for no limit, passes. Raises `AvatarError` naming the field, its range and its value.
+    """
+    bounds = {"at least": low, "above": above, "at most": high}
+    expected = " and ".join(f"{word} {bound}" for word, bound in bounds.items() if math.isfinite(bound))
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and not (low <= value <= high and value > above):
+            raise AvatarError(f"{name}: expected {expected}, got {value}.")
+
+
 def check_shape(name: str, value: Any, pattern: str, **dims: int) -> dict[str, int]:
     """Checks an array or tensor against a pattern such as ``"B N 3"`` and returns its named sizes.
 
     A number in the pattern is a fixed size, a name is bound at its first use (or by ``dims``) and must agree
-    afterwards, and a leading ``...`` stands for any number of dimensions.
-
-    Raises:
-        AvatarError: naming the argument, the expected pattern and the shape that came.
+    afterwards, and a leading ``...`` stands for any number of dimensions. Raises `AvatarError` naming the argument, the
+    expected pattern and the shape that came.
     """
-    sizes = dict(dims)
-    expected = pattern.split()
-    shape = tuple(getattr(value, "shape", ()))
+    sizes, expected, shape = dict(dims), pattern.split(), tuple(getattr(value, "shape", ()))
     tail = shape
-    if expected and expected[0] == "...":
+    if expected[:1] == ["..."]:
         expected = expected[1:]
-        tail = shape[len(shape) - len(expected) :] if len(shape) >= len(expected) else ()
-    matches = len(tail) == len(expected)
-    for size, token in zip(tail, expected):
-        want = int(token) if token.isdigit() else sizes.setdefault(token, size)
-        matches = matches and size == want
-    if not matches:
+        tail = shape[max(0, len(shape) - len(expected)) :]
+    wanted = [int(token) if token.isdigit() else sizes.setdefault(token, size) for token, size in zip(expected, tail)]
+    if len(tail) != len(expected) or list(tail) != wanted:
         bound = ", ".join(f"{key}={sizes[key]}" for key in pattern.split() if key in dims)
-        raise AvatarError(
-            f"{name}: expected shape ({pattern.replace(' ', ', ')})"
-            + (f" with {bound}" if bound else "")
-            + f", got {shape if hasattr(value, 'shape') else type(value).__name__}."
-        )
+        form = f"({', '.join(pattern.split())})" + (f" with {bound}" if bound else "")
+        came = shape if hasattr(value, "shape") else type(value).__name__
+        raise AvatarError(f"{name}: expected shape {form}, got {came}.")
     return sizes
 
 
 def check_finite(name: str, value: Any) -> None:
-    """Refuses NaN and infinity in an array or tensor, saying how many and where the first one stands.
-
-    Raises:
-        AvatarError: naming the argument and the first bad index.
-    """
+    """Raises `AvatarError` for NaN or infinity in an array or tensor: how many, and the index of the first."""
     array = value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)
     bad = ~np.isfinite(array)
     if bad.any():
@@ -140,11 +137,7 @@ def check_finite(name: str, value: Any) -> None:
 
 
 def check_oriented(points: Any, normals: Any) -> dict[str, int]:
-    """Checks points and normals ``(N, 3)`` for their shapes and finite values; gives N.
-
-    Raises:
-        AvatarError: naming the argument.
-    """
+    """Checks points and normals ``(N, 3)`` for their shapes and finite values; gives N."""
     dims = check_shape("points", points, "N 3")
     check_shape("normals", normals, "N 3", **dims)
     check_finite("points", points)
@@ -153,11 +146,7 @@ def check_oriented(points: Any, normals: Any) -> dict[str, int]:
 
 
 def check_faces(faces: np.ndarray, count: int) -> None:
-    """Checks triangles ``(F, 3)``: at least one, of whole numbers, all indices of ``count`` vertices.
-
-    Raises:
-        AvatarError: with what was expected.
-    """
+    """Checks triangles ``(F, 3)``: at least one, of whole numbers, all indices of ``count`` vertices."""
     check_shape("faces", faces, "F 3")
     if not len(faces) or not np.issubdtype(faces.dtype, np.integer):
         raise AvatarError(f"faces: expected triangles of whole numbers, got {len(faces)} of {faces.dtype}.")
@@ -166,22 +155,14 @@ def check_faces(faces: np.ndarray, count: int) -> None:
 
 
 def check_suffix(path: Path, endings: Iterable[str], what: str) -> str:
-    """The ending of a file's name in lower case.
-
-    Raises:
-        DataError: for one that is none of ``endings``.
-    """
-    if path.suffix.lower() not in endings:
+    """The ending of a file's name in lower case; raises `DataError` for one that is none of ``endings``."""
+    if (suffix := path.suffix.lower()) not in endings:
         raise DataError(path, f"expected {what} ending in {' or '.join(endings)}, got {path.suffix!r}.")
-    return path.suffix.lower()
+    return suffix
 
 
 def check_file(path: Path, limit: int) -> None:
-    """Refuses a file before it is read.
-
-    Raises:
-        DataError: for one that is missing, empty or larger than ``limit`` bytes.
-    """
+    """Raises `DataError` for a file, before it is read, that is missing, empty or larger than ``limit`` bytes."""
     if not path.is_file():
         raise DataError(path, "there is no such file.")
     if not 0 < (size := path.stat().st_size) <= limit:
@@ -191,8 +172,7 @@ def check_file(path: Path, limit: int) -> None:
 def require(package: str) -> ModuleType:
     """Imports an optional package at the place of its use.
 
-    Raises:
-        AvatarError: with the line that installs it, when the package or one of its libraries is missing.
+    Raises `AvatarError`, with the line to run, when the package or one of its libraries is missing.
     """
     try:
         return importlib.import_module(package)

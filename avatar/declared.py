@@ -6,51 +6,30 @@ that they name, are executed alone. Functions and methods are left out, and with
 """
 
 from __future__ import annotations
-import __future__
 
 import ast
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from functools import cache
-from inspect import get_annotations
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from avatar.verbs import resolve
 
 PACKAGE = Path(__file__).resolve().parent
-HOMES: dict[type, Source] = {}  # of all classes made here
-COMMENTS: dict[type, dict[str, str]] = {}  # behind their fields
+COMMENTS: dict[type, dict[str, str]] = {}  # behind the fields of all classes made here
 
 
 def declared(name: str) -> type:
-    """The dataclass that ``module:Class`` names, with those that it is made of; their modules are not imported.
-
-    Modules outside this package are.
-    """
+    """The dataclass that ``module:Class`` names, with those in it; modules of this package are not imported for it."""
     module, _, attribute = name.partition(":")
-    if module.partition(".")[0] != PACKAGE.name:
-        return resolve(name)
-    kind = source(module).find(attribute)
-    settle_types(kind)
-    return kind
+    return source(module).find(attribute) if module.partition(".")[0] == PACKAGE.name else resolve(name)
 
 
 def comments(kind: type) -> dict[str, str]:
     """What the comments behind the fields of a declared dataclass say; empty for a field without one."""
     known = {name: text for base in reversed(kind.__mro__) for name, text in COMMENTS.get(base, {}).items()}
     return {field.name: known.get(field.name, "") for field in fields(kind)}
-
-
-def settle_types(hint: Any) -> None:
-    """Gives the annotations of all dataclasses in a type their values, as `typing.get_type_hints` reads them."""
-    for part in get_args(hint):
-        settle_types(part)
-    for base in hint.__mro__ if is_dataclass(hint) else ():
-        for name, text in get_annotations(base).items():
-            if base in HOMES and isinstance(text, str):
-                base.__annotations__[name] = HOMES[base].evaluate(text)
-                settle_types(base.__annotations__[name])
 
 
 def method_settings() -> dict[str, str]:
@@ -87,12 +66,6 @@ class Source:
             self.define(name, self.statements[name])
         return self.values[name]
 
-    def evaluate(self, text: str) -> Any:
-        """The value of an annotation."""
-        tree = ast.parse(text, mode="eval")
-        self.follow(tree)
-        return eval(compile(tree, self.path, "eval"), self.values)
-
     def define(self, name: str, node: ast.stmt) -> None:
         """Executes the statement that defines a name, after those that it needs."""
         if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == PACKAGE.name:
@@ -103,21 +76,15 @@ class Source:
         else:
             if isinstance(node, ast.ClassDef):
                 node.body = [part for part in node.body if not isinstance(part, ast.FunctionDef)] or [ast.Pass()]
-            self.follow(node)
+            elif isinstance(node, ast.AnnAssign):
+                node = ast.Assign([node.target], node.value)
+            for part in ast.walk(node):
+                if isinstance(part, ast.Name) and part.id in self.statements and isinstance(part.ctx, ast.Load):
+                    self.find(part.id)
             tree = ast.fix_missing_locations(ast.Module([node], []))
-            exec(compile(tree, self.path, "exec", __future__.annotations.compiler_flag, True), self.values)
+            exec(compile(tree, self.path, "exec", dont_inherit=True), self.values)
         if isinstance(node, ast.ClassDef):
-            HOMES[self.values[name]] = self
             COMMENTS[self.values[name]] = dict(self.field_comments(node))
-
-    def follow(self, node: ast.AST) -> None:
-        """Defines the names of this module that a piece of its source needs; annotations are no part of that."""
-        if isinstance(node, ast.Name) and node.id in self.statements and isinstance(node.ctx, ast.Load):
-            self.find(node.id)
-        for field, part in ast.iter_fields(node):
-            for child in part if isinstance(part, list) else [part]:
-                if isinstance(child, ast.AST) and field != "annotation":
-                    self.follow(child)
 
     def field_comments(self, node: ast.ClassDef) -> Iterator[tuple[str, str]]:
         """The fields of a class, each with the comment behind it."""

@@ -26,25 +26,12 @@ if TYPE_CHECKING:
 FIRST_PROCESS = os.getpid()  # that this module was imported in; any other is a fork of it
 report = logging.getLogger(__name__)
 
-APT_PACKAGES = {
-    "libusb-1.0": "libusb-1.0-0",
-    "libGL.so": "libgl1",
-    "libEGL.so": "libegl1",
-    "libX11.so": "libx11-6",
-    "libudev.so": "libudev1",
-    "libidn2.so": "libidn2-0",
-    "libgomp.so": "libgomp1",
-    "libXrender.so": "libxrender1",
-}
-OPTIONAL = {
-    "open3d": "meshing",
-    "pyvista": "pictures",
-    "pygltflib": "rigged GLB export",
-    "pxr": "USD export",
-    "tensorboard": "training curves in TensorBoard",
-    "newton": "simulating new outfits",
-    "anny": "bodies of other shapes",
-}
+APT_PACKAGES = {"libusb-1.0": "libusb-1.0-0", "libGL.so": "libgl1", "libEGL.so": "libegl1", "libX11.so": "libx11-6"}
+APT_PACKAGES |= {"libudev.so": "libudev1", "libidn2.so": "libidn2-0", "libgomp.so": "libgomp1"}
+APT_PACKAGES |= {"libXrender.so": "libxrender1"}
+OPTIONAL = {"open3d": "meshing", "pyvista": "pictures", "pygltflib": "rigged GLB export", "pxr": "USD export"}
+OPTIONAL |= {"tensorboard": "training curves in TensorBoard", "newton": "simulating new outfits"}
+OPTIONAL |= {"anny": "bodies of other shapes"}
 
 
 @dataclass(frozen=True)
@@ -60,26 +47,27 @@ class Finding:
 
 def inspect_machine() -> list[Finding]:
     """Looks at Python, packages, system libraries and accelerators; imports each package in its own process."""
-    version = platform.python_version()
-    findings = [Finding("python", sys.version_info >= (3, 11), version, "install Python 3.11 or newer")]
-    findings += [inspect_package(name, "core", needed=True) for name in CORE]
-    findings += [inspect_package(name, use, needed=False) for name, use in OPTIONAL.items()]
     browser, hint = shutil.which("chromium") or shutil.which("google-chrome"), "apt-get install -y chromium"
-    return [*findings, Finding("chromium", bool(browser), browser or "not found", hint, needed=False)]
+    return [
+        Finding("python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer"),
+        *(inspect_package(name, "core", needed=True) for name in CORE),
+        *(inspect_package(name, use, needed=False) for name, use in OPTIONAL.items()),
+        Finding("chromium", bool(browser), browser or "not found", hint, needed=False),
+    ]
 
 
 def inspect_package(name: str, use: str, needed: bool) -> Finding:
     """Imports a package in a fresh process, so that a crash or a missing shared library is only a finding."""
     probe = [sys.executable, "-c", f"import {name}"]
     result = subprocess.run(probe, capture_output=True, text=True, timeout=120)
-    if result.returncode == 0:
-        try:
-            version = importlib.metadata.version(DISTRIBUTIONS.get(name, name))
-        except importlib.metadata.PackageNotFoundError:
-            version = "installed"
-        return Finding(f"{name} ({use})", True, version, needed=needed)
-    last = (result.stderr.strip().splitlines() or [f"the process died with code {result.returncode}"])[-1]
-    return Finding(f"{name} ({use})", False, last, install_hint(name, last), needed)
+    if result.returncode:
+        last = (result.stderr.strip().splitlines() or [f"the process died with code {result.returncode}"])[-1]
+        return Finding(f"{name} ({use})", False, last, install_hint(name, last), needed)
+    try:
+        version = importlib.metadata.version(DISTRIBUTIONS.get(name, name))
+    except importlib.metadata.PackageNotFoundError:
+        version = "installed"
+    return Finding(f"{name} ({use})", True, version, needed=needed)
 
 
 def install_hint(package: str, message: str) -> str:
@@ -99,11 +87,7 @@ def accelerator_type() -> str:
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of a name; ``auto`` is that of `accelerator_type`. All that is put on a device asks here.
-
-    Raises:
-        AvatarError: for a device that there is not.
-    """
+    """The device of a name, ``auto`` for `accelerator_type`; raises `AvatarError` for one that there is not."""
     import torch
 
     from avatar.checks import AvatarError
@@ -116,24 +100,14 @@ def choose_device(name: str) -> torch.device:
         raise AvatarError(f"device: expected auto, cpu or a CUDA device there is, got {name!r} ({reason}).") from error
 
 
-def accelerator() -> str:
-    """What torch would train on, in words."""
-    import torch
-
-    if accelerator_type() == "cuda":
-        return f"CUDA {torch.version.cuda}: {torch.cuda.get_device_name()}"
-    return f"CPU with {torch.get_num_threads()} threads"
-
-
 @contextmanager
 def prepared_process() -> Iterator[None]:
     """Prepares the process for work on the CPU, as a ``with`` block or as the decorator of every function that does it.
 
     Freed memory is kept from then on. Numbers below 1e-38 count as zero, in this thread and in the OpenMP threads that
     work for it, for the length of the block: processors are slow with such numbers, and the steep softplus of a signed
-    distance is full of them (docs/performance.md). Afterwards all is as the caller had it, for it changes the caller's
-    arithmetic, too. Blocks may be nested. A job is prepared alike from the command line and from Python, so its bits
-    are the same; how idle threads wait is read when torch is imported, and a warning says when that was too early.
+    distance is full of them (docs/performance.md). Afterwards the caller's arithmetic is as it was. Blocks may be
+    nested. How idle threads wait is read when torch is imported, and a warning says when that was too early.
     """
     warn_once_of_early_torch()
     keep_freed_memory()
@@ -149,9 +123,8 @@ def prepared_process() -> Iterator[None]:
 def flush_denormals(on: bool) -> None:
     """Has this thread, and the OpenMP threads that work for it, take such numbers for zero, or count them in full.
 
-    The processor has this switch in each thread, and a new thread takes over that of the one that starts it. So
-    OpenMP's idle threads are ended: the next ones are started from this thread when there is work. A forked process
-    has none of its parent's threads and must not wait for them.
+    New threads take over this processor setting from the one that starts them, so OpenMP's idle threads are ended. A
+    forked process has none of its parent's threads and must not wait for them.
     """
     import torch
 
@@ -175,9 +148,9 @@ def keep_freed_memory() -> bool:
     """Has the C library keep what is freed for what is asked for next; says whether it could be set so.
 
     By default it gives arrays above 32 MiB back to the system at once, and every new one costs a page fault for each
-    4 KiB: a third of a full-size decoder's time on the CPU. The price is memory, for pieces do not always fit: a
-    full-size training step then peaks a quarter higher.
+    4 KiB: a third of a full-size decoder's time on the CPU. The price is a quarter more memory at the peak of a
+    full-size training step, for pieces do not always fit.
     """
     most_maps, trim_above = -4, -1  # M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's malloc.h
-    tell = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    return tell is not None and bool(tell(most_maps, 0) and tell(trim_above, 2**31 - 1))
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    return mallopt is not None and bool(mallopt(most_maps, 0) and mallopt(trim_above, 2**31 - 1))

@@ -1,4 +1,4 @@
-"""Command lines for this machine: how packages are installed, an environment is activated and verbs are run here.
+"""Command lines as they are printed: how packages are installed, an environment is activated and verbs are run here.
 
 The standard library alone, for what it prints is needed most where nothing else is installed.
 """
@@ -10,6 +10,8 @@ import re
 import shlex
 import shutil
 import sys
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 DISTRIBUTION = "clothed-avatar"  # on a package index; `avatar` belongs to somebody else there
@@ -17,34 +19,25 @@ STOPPED = os.EX_TEMPFAIL  # exit code 75: stopped by a signal, nothing is wrong,
 PIPE_CLOSED = 128 + 13  # as a shell reports a process that SIGPIPE ended: the reader of the output has left
 PACKAGE = Path(__file__).resolve().parent
 CORE = ("torch", "numpy", "scipy", "trimesh", "roma", "hydra", "tqdm", "safetensors", "matplotlib", "skimage")
-EXTRAS = {
-    "open3d": "mesh",
-    "pyvista": "pictures",
-    "pygltflib": "export",
-    "pxr": "export",
-    "tensorboard": "log",
-    "newton": "simulate",
-    "warp": "simulate",
-    "anny": "anny",
-    "hydra_plugins": "cluster",
-}
-DISTRIBUTIONS = {  # where a distribution is named otherwise than what is imported
-    "hydra": "hydra-core",
-    "skimage": "scikit-image",
-    "pxr": "usd-core",
-    "open3d": "open3d-cpu",
-    "warp": "warp-lang",
-}
+EXTRAS = {"open3d": "mesh", "pyvista": "pictures", "pygltflib": "export", "pxr": "export", "tensorboard": "log"}
+EXTRAS |= {"newton": "simulate", "warp": "simulate", "anny": "anny", "hydra_plugins": "cluster"}
+# Where a distribution is named otherwise than what is imported
+DISTRIBUTIONS = {"hydra": "hydra-core", "skimage": "scikit-image", "pxr": "usd-core", "warp": "warp-lang"}
+DISTRIBUTIONS |= {"open3d": "open3d-cpu"}
 SYSTEM_LIBRARIES = {  # Debian's packages with the libraries that a package loads
     "open3d": "libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0",
     "pyvista": "libgl1 libegl1",
 }
+PLAIN = re.compile(r"(?!(?:null|true|false|nan|inf)$)(?:[a-z_/]|\.{1,2}/)[\w./-]*", re.ASCII | re.IGNORECASE)
 
 
 def checkout() -> Path | None:
     """The folder of the source checkout that this program runs from; None where it was installed from a wheel."""
     root = PACKAGE.parent
     return root if (root / "setup.cfg").is_file() and (root / "tools").is_dir() else None
+
+
+CONF = (checkout() or PACKAGE) / "conf"  # a wheel has it in the package
 
 
 def install_line(package: str) -> str:
@@ -110,3 +103,25 @@ def activation_line() -> str:
         return activate
     set_up = ["make", "setup"] if Path.cwd() == root else ["make", "-C", str(root), "setup"]
     return f"{shlex.join(set_up)} && {activate}"
+
+
+def quote(text: str) -> str:
+    """A text as one value for Hydra, in quotes unless it is read as it is without them."""
+    if PLAIN.fullmatch(text):
+        return text
+    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)  # no interpolation
+    mark = "'" if '"' in text and "'" not in text else '"'
+    return mark + re.sub(rf"(\\*)({mark}|\Z)", lambda m: m[1] * 2 + (f"\\{mark}" if m[2] else ""), text) + mark
+
+
+def option(name: str, value: str | Path | Iterable[str | Path]) -> str:
+    """An option and its value as one argument of a command line, which is read back as it is."""
+    single = isinstance(value, (str, Path))
+    return f"{name}={quote(str(value))}" if single else f"{name}=[{','.join(quote(str(item)) for item in value)}]"
+
+
+def expand(text: str) -> str:
+    """A path with the home folder in the place of its ``~``, which shells leave as it is after ``=``."""
+    with suppress(RuntimeError):  # of a user that there is not: a name that begins so
+        return str(Path(text).expanduser()) if text.startswith("~") else text
+    return text

@@ -1,4 +1,4 @@
-"""Worker processes: a pool of them, which the terminal's Ctrl-C does not reach and which ends with who started it."""
+"""Worker processes: a pool of them, which the terminal's Ctrl-C does not reach and which ends with its parent."""
 
 from __future__ import annotations
 
@@ -33,13 +33,9 @@ def in_workers(
     prepare: Callable[..., None] | None = None,
     arguments: tuple[Any, ...] = (),
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Jobs and their results, as they are finished in worker processes; left early, it ends the workers at once.
+    """Jobs, which are arguments of ``work``, and their results as they are finished in worker processes.
 
-    Args:
-        work: called with each job's arguments.
-        jobs: arguments of each call.
-        workers: how many processes.
-        prepare, arguments: called once in each worker.
+    Each worker calls ``prepare(*arguments)`` first. Left early, it ends the workers at once.
     """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, _begin_work, (prepare, arguments)) as pool:

@@ -1,7 +1,4 @@
-"""How far a loop is: a bar on a terminal, a line now and then elsewhere; and a count of what this process has done.
-
-Lines are logged, so that a caller from Python hears them if it listens.
-"""
+"""Progress of loops, a bar on a terminal and logged lines elsewhere; and a count of what this process has done."""
 
 from __future__ import annotations
 
@@ -10,7 +7,8 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Self, TypeVar
 
 from tqdm import tqdm
@@ -21,36 +19,24 @@ WORK: Counter[str] = Counter()  # of this process: `step`s trained, pieces `made
 report = logging.getLogger(__name__)
 
 
+@dataclass
 class Progress:
-    """A loop of ``total`` pieces of work that a budget of seconds may end before; a context manager."""
+    """A loop of ``total`` pieces of work that a budget may end before; a context manager."""
 
-    def __init__(
-        self,
-        what: str,
-        total: int,
-        unit: str = "frame",
-        done: int = 0,
-        budget: float | None = None,
-        spent: float = 0.0,
-        silent: bool = False,
-    ):
-        """Begins a loop.
+    what: str
+    total: int
+    unit: str = "frame"
+    done: int = 0  # pieces finished earlier
+    budget: float | None = None  # seconds of work after which it ends as well
+    spent: float = 0.0  # seconds of it that were spent earlier
+    silent: bool = False  # for processes other than the main one
+    clock: Callable[[], float] = time.monotonic  # whose seconds the budget counts
 
-        Args:
-            what: the loop, for the user.
-            total: pieces of work at most.
-            unit: of one piece.
-            done: pieces that were finished earlier.
-            budget: seconds of work after which it ends as well; None for no limit.
-            spent: seconds of it that were spent earlier.
-            silent: show nothing (processes beside the leading one).
-        """
-        self.what, self.total, self.unit, self.done, self.before = what, total, unit, done, done
-        self.budget, self.spent, self.silent = budget, spent, silent
-        self.started = self.logged = time.monotonic()
-        self.values, self.logged_count = "", -1
-        watched = not silent and sys.stderr.isatty()
-        self.bar = tqdm(total=total, initial=done, desc=what, unit=unit) if watched else None
+    def __post_init__(self):
+        self.before, self.values, self.logged_count = self.done, "", -1
+        self.started, self.logged = self.clock(), time.monotonic()
+        watched = not self.silent and sys.stderr.isatty()
+        self.bar = tqdm(total=self.total, initial=self.done, desc=self.what, unit=self.unit) if watched else None
 
     def __enter__(self) -> Self:
         return self
@@ -65,7 +51,7 @@ class Progress:
     @property
     def seconds(self) -> float:
         """Seconds since it began."""
-        return time.monotonic() - self.started
+        return self.clock() - self.started
 
     def seconds_left(self) -> float:
         """Seconds until all is done or the budget is spent, whichever comes first; infinite while nothing is known."""
@@ -118,11 +104,7 @@ def tracked(
 
 def in_words(seconds: float) -> str:
     """A time for people: ``35 s``, ``12 min 5 s``, ``3 h 20 min``."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    if minutes < 60:
-        return f"{minutes} min {rest} s" if rest else f"{minutes} min"
+    minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if minutes else f"{hours} h"
+    parts = [(hours, "h"), (minutes, "min"), (rest if not hours else 0, "s")]
+    return " ".join(f"{count} {unit}" for count, unit in parts if count) or "0 s"

@@ -7,10 +7,11 @@ import types
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from avatar.checks import AvatarError, did_you_mean, sentences, unknown_name
 
+FileName = Annotated[str, "a name, or the path of a file"]
 Settings = TypeVar("Settings")
 
 
@@ -28,15 +29,10 @@ def settings_to_dict(settings: Any) -> Any:
 
 
 def settings_from_dict(kind: type[Settings], values: dict[str, Any], name: str = "") -> Settings:
-    """Builds a settings dataclass from plain values; missing keys keep their defaults.
+    """Builds a settings dataclass from plain values, nested alike; missing keys keep their defaults.
 
-    Args:
-        kind: the dataclass; its ``__post_init__`` checks ranges.
-        values: option name to value, nested like the dataclass.
-        name: where these options stand, for messages.
-
-    Raises:
-        AvatarError: on an unknown option (with the nearest name) or a value of the wrong type.
+    Raises `AvatarError`, with ``name`` for where these options stand, on an unknown option (with the nearest name), a
+    value of the wrong type, or one that the class's ``__post_init__`` refuses.
     """
     hints = get_type_hints(kind)
     for key in values:
@@ -53,8 +49,7 @@ def settings_from_dict(kind: type[Settings], values: dict[str, Any], name: str =
 def convert_value(hint: Any, value: Any, name: str) -> Any:
     """One plain value as its declared type: scalars, enums, paths, optionals, tuples, lists, dicts, dataclasses.
 
-    Raises:
-        AvatarError: naming the option, the type expected and the value that came.
+    Raises `AvatarError` naming the option, the type expected and the value that came.
     """
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):

@@ -1,4 +1,4 @@
-"""The verbs: what each does, the function that does it, and the class of its settings, by name.
+"""Verbs: what each does, the function that does it, and the class of its settings, by name.
 
 Names only, so that starting one verb imports nothing of the others.
 """
@@ -11,124 +11,90 @@ from pathlib import Path
 from typing import Any
 
 
-@dataclass(frozen=True)
+@dataclass
 class Verb:
     """One verb: a sentence for the user, then ``module:attribute`` of its function and of its settings class.
 
-    A verb without a settings class reads its own arguments; ``then`` is called with the settings of a multirun's
-    finished jobs. Its help begins with ``options``, a dozen at most. ``conf`` is the verb's configuration file where
-    that is not ``conf/<verb>.yaml``, as for the verbs of ``tools/`` that are not in the package and so not in `VERBS`.
+    A settings class without a module is in the function's. A verb without one reads its own arguments; ``then`` is
+    called with the settings of a multirun's finished jobs. ``conf`` is the verb's configuration file where that is not
+    ``conf/<verb>.yaml``, as for the verbs of ``tools/`` that are not in the package and so not in `VERBS`.
     """
 
     does: str
     run: str
     settings: str = ""
     then: str = ""
-    options: str = ""  # names with blanks between
     conf: Path | None = None
+
+    def __post_init__(self):
+        if self.settings and ":" not in self.settings:
+            self.settings = f"{self.run.partition(':')[0]}:{self.settings}"
 
 
 VERBS = {
-    "simulate": Verb(
-        "makes outfits of the open dataset",
-        "avatar.simulate.recording:simulate",
-        "avatar.simulate.recording:SimulateConfig",
-        options="preset outfits shapes root train test train_motions test_motions fps seconds workers seed",
-    ),
+    "simulate": Verb("makes outfits of the open dataset", "avatar.simulate.recording:simulate", "SimulateConfig"),
     "canonicalize": Verb(
         "learns an outfit's skinning field and brings its scans to the T-pose",
         "avatar.pipeline.canonicalization:canonicalize",
         "avatar.methods.canonicalizer:CanonicalizeConfig",
-        options="dataset outfit canonicalizer_size name weights scored "
-        "pictures train.first_steps train.second_steps data_root runs_root device",
     ),
     "template": Verb(
         "makes an outfit's clothed template from its canonical scans",
         "avatar.pipeline.templating:template",
         "avatar.runs.templating:TemplateConfig",
-        options="dataset outfit canonical clothed.edge clothed.weights clothed.mirror clothed.refine.steps "
-        "pictures data_root runs_root",
     ),
     "train": Verb(
-        "trains an avatar, or goes on with it",
-        "avatar.runs.training:train",
-        "avatar.methods.settings:RunConfig",
-        options="dataset outfit method size name train.minutes "
-        "train.steps train.batch canonical data_root runs_root device",
+        "trains an avatar, or goes on with it", "avatar.runs.training:train", "avatar.methods.settings:RunConfig"
     ),
     "fit": Verb(
-        "fits an unseen outfit from one scan",
-        "avatar.runs.training:fit_outfit",
-        "avatar.methods.settings:FitConfig",
-        options="run dataset outfit frame name steps points data_root runs_root device",
+        "fits an unseen outfit from one scan", "avatar.runs.training:fit_outfit", "avatar.methods.settings:FitConfig"
     ),
-    "predict": Verb(
-        "predicts posed point clouds",
-        "avatar.pipeline.scores:predict",
-        "avatar.pipeline.scores:PredictConfig",
-        options="run split motion fps up points checkpoint data_root device",
-    ),
-    "evaluate": Verb(
-        "scores predictions beside their floors",
-        "avatar.pipeline.scores:evaluate",
-        "avatar.pipeline.scores:EvaluateConfig",
-        options="runs split floors predictions label dataset outfit data_root out",
-    ),
+    "predict": Verb("predicts posed point clouds", "avatar.pipeline.scores:predict", "PredictConfig"),
+    "evaluate": Verb("scores predictions beside their floors", "avatar.pipeline.scores:evaluate", "EvaluateConfig"),
     "experiment": Verb(
         "runs every job of a table, then makes it",
         "avatar.pipeline.experiments:experiment",
-        "avatar.pipeline.experiments:ExperimentConfig",
+        "ExperimentConfig",
         "avatar.pipeline.experiments:tabulate_experiment",
-        options="experiment budget dataset outfit method size "
-        "train.minutes train.steps split.train_fraction compare.out data_root runs_root",
     ),
-    "compare": Verb(
-        "makes one table of many runs' scores",
-        "avatar.pipeline.comparison:compare",
-        "avatar.pipeline.comparison:CompareConfig",
-        options="table runs runs_root dataset name methods metrics baseline pictures splits data_root out",
-    ),
-    "seams": Verb(
-        "measures predictions at the seams of the UV atlas",
-        "avatar.pipeline.seams:seams",
-        "avatar.pipeline.seams:SeamsConfig",
-        options="runs baseline table split points frames data_root out",
-    ),
-    "mesh": Verb(
-        "meshes predictions",
-        "avatar.pipeline.surfaces:mesh",
-        "avatar.pipeline.surfaces:MeshConfig",
-        options="run predictions frames formats poisson.depth poisson.max_hole",
-    ),
-    "export": Verb(
-        "writes animation files of a predicted motion",
-        "avatar.pipeline.surfaces:export",
-        "avatar.pipeline.surfaces:ExportConfig",
-        options="run predictions fps motion up data_root",
-    ),
-    "report": Verb(
-        "writes a run's page",
-        "avatar.pipeline.reporting:report",
-        "avatar.pipeline.reporting:ReportConfig",
-        options="run against split frames data_root",
-    ),
-    "demo": Verb(
-        "does the main job on the embedded sample",
-        "avatar.pipeline.demo:demo",
-        "avatar.pipeline.demo:DemoConfig",
-        options="dataset outfit size train.minutes static_share points meshes data_root runs_root device",
-    ),
+    "compare": Verb("makes one table of many runs' scores", "avatar.pipeline.reporting:compare", "CompareConfig"),
+    "seams": Verb("measures predictions at the seams of the UV atlas", "avatar.pipeline.seams:seams", "SeamsConfig"),
+    "mesh": Verb("meshes predictions", "avatar.pipeline.surfaces:mesh", "MeshConfig"),
+    "export": Verb("writes animation files of a predicted motion", "avatar.pipeline.surfaces:export", "ExportConfig"),
+    "report": Verb("writes a run's page", "avatar.pipeline.reporting:report", "ReportConfig"),
+    "demo": Verb("does the main job on the embedded sample", "avatar.pipeline.experiments:demo", "DemoConfig"),
     "parameters": Verb(
         "counts every method's parameters",
-        "avatar.plain_verbs:parameters",
+        "avatar.cli:parameters",
         "avatar.pipeline.parameters:ParametersConfig",
-        options="out",
     ),
-    "convert_body": Verb("converts an SMPL, SMPL-H or SMPL-X file", "avatar.plain_verbs:convert_body"),
-    "make_body": Verb("makes a body of any shape", "avatar.plain_verbs:make_body"),
-    "make_motion": Verb("writes one of the open dataset's motions as a file", "avatar.plain_verbs:make_motion"),
-    "pack": Verb("writes an outfit as packed frames, as POP's line stores them", "avatar.plain_verbs:pack"),
-    "doctor": Verb("lists what is installed and what is missing", "avatar.plain_verbs:doctor"),
+    "convert_body": Verb("converts an SMPL, SMPL-H or SMPL-X file", "avatar.cli:convert_body"),
+    "make_body": Verb("makes a body of any shape", "avatar.cli:make_body"),
+    "make_motion": Verb("writes one of the open dataset's motions as a file", "avatar.cli:make_motion"),
+    "pack": Verb("writes an outfit as packed frames, as POP's line stores them", "avatar.cli:pack"),
+    "doctor": Verb("lists what is installed and what is missing", "avatar.cli:doctor"),
+}
+
+OPTIONS = {  # that a verb's help begins with, a dozen at most
+    "simulate": "preset outfits shapes root train test train_motions test_motions fps seconds workers seed",
+    "canonicalize": "dataset outfit canonicalizer_size name weights scored pictures train.first_steps "
+    "train.second_steps data_root runs_root device",
+    "template": "dataset outfit canonical clothed.edge clothed.weights clothed.mirror clothed.refine.steps pictures "
+    "data_root runs_root",
+    "train": "dataset outfit method size name train.minutes train.steps train.batch canonical data_root runs_root "
+    "device",
+    "fit": "run dataset outfit frame name steps points data_root runs_root device",
+    "predict": "run split motion fps up points checkpoint data_root device",
+    "evaluate": "runs split floors predictions label dataset outfit data_root out",
+    "experiment": "experiment budget dataset outfit method size train.minutes train.steps split.train_fraction "
+    "compare.out data_root runs_root",
+    "compare": "table runs runs_root dataset name methods metrics baseline pictures splits data_root out",
+    "seams": "runs baseline table split points frames data_root out",
+    "mesh": "run predictions frames formats poisson.depth poisson.max_hole",
+    "export": "run predictions fps motion up data_root",
+    "report": "run against split frames data_root",
+    "demo": "dataset outfit size train.minutes static_share points meshes data_root runs_root device",
+    "parameters": "out",
 }
 
 SHARED = {  # what options mean in several verbs

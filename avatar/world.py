@@ -1,9 +1,8 @@
 """Data-parallel processes under torchrun: ranks, shards of a batch, and the collectives that training needs.
 
-Gradients are averaged, the statistics of every normalisation are those of the whole batch (`nn.layers`), and what
-is computed once an outfit is computed for all outfits of the step in every process; so a run gives the losses and
-gradients of one process with the same batch, to rounding (with noise on the input: in distribution). NCCL serves CUDA,
-gloo the CPU. torch is imported where it is needed, for every command asks for its world, and help needs no torch.
+Gradients are averaged, normalisations have the whole batch's statistics (`nn.layers`), and every process computes what
+is computed once an outfit for all outfits of the step; so a run has the losses and gradients of one process with the
+same batch, to rounding (with noise on the input: in distribution). Help needs no torch, so it is imported where needed.
 """
 
 from __future__ import annotations
@@ -34,15 +33,10 @@ class World:
         return self.rank == 0
 
     def shard(self, batch: int) -> slice:
-        """The frames of a batch that this process trains on.
-
-        Raises:
-            AvatarError: when a batch cannot be divided evenly.
-        """
+        """The frames of a batch that this process trains on; raises `AvatarError` if they cannot be divided evenly."""
         if batch % self.size:
             raise AvatarError(f"batch: expected a multiple of the {self.size} processes, got {batch}.")
-        count = batch // self.size
-        return slice(self.rank * count, (self.rank + 1) * count)
+        return slice(self.rank * batch // self.size, (self.rank + 1) * batch // self.size)
 
 
 def current_world() -> World:
@@ -60,26 +54,21 @@ def torchrun_world() -> Iterator[World]:
         yield World()
         return
     import torch
-    import torch.distributed as dist
 
     local, cuda = int(os.environ["LOCAL_RANK"]), torch.cuda.is_available()
     if cuda:
         if local >= torch.cuda.device_count():
             raise AvatarError(f"--nproc-per-node: expected at most {torch.cuda.device_count()} here (CUDA devices).")
         torch.cuda.set_device(local)
-    dist.init_process_group("cpu:gloo,cuda:nccl" if cuda else "gloo")
+    torch.distributed.init_process_group("cpu:gloo,cuda:nccl" if cuda else "gloo")
     try:
         yield current_world()
     finally:
-        dist.destroy_process_group()
+        torch.distributed.destroy_process_group()
 
 
 def require_single_process(what: str) -> None:
-    """Check that torchrun started no other processes, for jobs that train in one.
-
-    Raises:
-        AvatarError: in every process where there are several.
-    """
+    """Raises `AvatarError` in every process where torchrun started several, for jobs that train in one."""
     if current_world().size > 1:
         raise AvatarError(f"{what}: expected one process, got {current_world().size}. Hint: start it without torchrun.")
 
@@ -89,10 +78,9 @@ def average(tensors: list[Tensor], world: World) -> None:
     if world.size == 1:
         return
     import torch
-    import torch.distributed as dist
 
     flat = torch.cat([tensor.flatten() for tensor in tensors])
-    dist.all_reduce(flat)
+    torch.distributed.all_reduce(flat)
     flat /= world.size
     for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors])):
         tensor.copy_(mean.view_as(tensor))

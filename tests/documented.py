@@ -26,7 +26,7 @@ from avatar.data.layouts import open_outfit_folder
 from avatar.data.packed_layout import write_packed_outfit
 from avatar.io.frames import write_manifest
 from avatar.io.motions import write_motion
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 ROOT = Path(__file__).parents[1]
 PROGRAMS = "python|python3|torchrun|srun|sbatch|make|pip|apt-get|conda|docker|bash|sh"
@@ -104,6 +104,7 @@ FEWER = {
     "closet1": ("method=pop,closet", "outfit=[tee,skirt]"),
     "closet3": ("method=pop,closet", "outfit=jacket"),
     "closet4": ("method=scale_global,csf,closet_pointnext", "outfit=jacket"),
+    "closet_pop": ("budget=steps", "outfit=skirt", "method=pop,closet", "train.seed=0"),
     "fractions": ("method=static", "split.train_fraction=1.0,0.5"),
     "loose": ("method=closet,closet_learned",),
     "normals": ("outfit=tee", "method=pop", "train.seed=0"),

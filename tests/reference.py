@@ -44,6 +44,17 @@ def ball_loop(centres: np.ndarray, points: np.ndarray, radius: float, k: int) ->
     return groups
 
 
+def ranked_ball_loop(
+    centres: np.ndarray, points: np.ndarray, radius: float, k: int, ranks: list[int]
+) -> list[list[int]]:
+    """The nearest point, then the k - 1 of lowest rank within a radius; short lists repeat the nearest."""
+    groups = []
+    for nearest, *others in ball_loop(centres, points, radius, len(points)):
+        group = [nearest, *sorted(set(others) - {nearest}, key=lambda i: ranks[i])][:k]
+        groups.append(group + [nearest] * (k - len(group)))
+    return groups
+
+
 def barycentric_loop(values: np.ndarray, vertex_ids: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
     """Values ``(V, C)`` blended at each sample: ``(N, C)``."""
     return np.array([sum(w * values[v] for v, w in zip(ids, weights)) for ids, weights in zip(vertex_ids, barycentric)])

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import avatar.config
-import avatar.pipeline.demo  # noqa: F401
+import avatar.pipeline.experiments  # noqa: F401
 
 
 def run(words: list[str], folder: str, output: str) -> None:

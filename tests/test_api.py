@@ -12,7 +12,7 @@ from avatar.io.meshes import read_mesh
 from avatar.io.motions import write_motion
 from avatar.io.points import read_points
 from avatar.records import PointCloud, Surface
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 PAGE = Path(__file__).parents[1] / "docs" / "python.md"
 QUICK = '"train.steps=2", "train.batch=1", "train.points=300", "train.scan_points=300", "scan.points=1000"'

@@ -1,10 +1,12 @@
 """The checks at public borders and what their messages say."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape, require
+from avatar.checks import AvatarError, DataError, check_finite, check_range, check_shape, require
 from avatar.invocation import EXTRAS
 
 
@@ -56,6 +58,28 @@ def test_check_finite_counts_and_places_what_is_not(make, bad):
 @pytest.mark.parametrize("good", [np.zeros((0, 3)), np.arange(4), torch.ones(3, requires_grad=True), 1.5])
 def test_check_finite_lets_numbers_pass(good):
     check_finite("value", good)
+
+
+@pytest.mark.parametrize(
+    ("value", "bounds", "expected"),
+    [
+        (0, {"low": 1}, "at least 1"),
+        (0.0, {"above": 0}, "above 0"),
+        (2, {"above": 0, "high": 1}, "above 0 and at most 1"),
+        (float("nan"), {"low": 0}, "at least 0"),
+    ],
+)
+def test_check_range_names_the_field_its_range_and_its_value(value, bounds, expected):
+    settings = SimpleNamespace(steps=1, size=value, limit=None)
+    with pytest.raises(AvatarError, match=f"^size: expected {expected}, got {value}\\.$"):
+        check_range(settings, "steps", "limit", "size", **bounds)
+
+
+def test_check_range_lets_bounds_and_missing_limits_pass():
+    settings = SimpleNamespace(low=1, high=3, limit=None)
+    check_range(settings, *vars(settings), low=1, high=3)
+    check_range(settings, *vars(settings), above=0.9)
+    check_range(SimpleNamespace(stretch=float("inf")), "stretch", above=1)
 
 
 def test_data_error_names_the_file_and_the_mend_and_is_an_avatar_error():

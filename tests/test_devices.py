@@ -13,7 +13,7 @@ from tiny import DECODER, SETTINGS, canonical_truth, quick_training
 
 from avatar.canonical.canonicalizer import CanonicalizerConfig
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.posed import DrawConfig
+from avatar.canonical.scans import DrawConfig
 from avatar.checks import AvatarError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
@@ -21,7 +21,7 @@ from avatar.environment import choose_device
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.io.canonical_scans import write_canonical_scan
+from avatar.io.frames import write_canonical_scan
 from avatar.io.motions import write_motion
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, CanonicalizerTask, CycleConfig
@@ -30,7 +30,7 @@ from avatar.pipeline.canonicalization import canonicalize
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.runs.training import fit_outfit, load_avatar
 from avatar.runs.training import train as train_run
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 pytestmark = pytest.mark.pretended
 UNET = {"levels": 3, "width": 4, "out_channels": 4}
@@ -48,12 +48,12 @@ SCALE = {
     "map_size": 16,
     "patches": 60,
 }
-PROBES = {"near_points": 60, "box_points": 40, "rim_points": 20}
+QUERIES = {"near_points": 60, "box_points": 40, "boundary_points": 20}
 SDF = {"widths": [32, 32], "skip": 1, "orders": 2}
 
 
 def implicit(**switches) -> dict:
-    return {"avatar": {"sdf": SDF, "texture": SDF, "gate_spacing": 0.2} | switches, "train": {"probes": PROBES}}
+    return {"avatar": {"sdf": SDF, "texture": SDF, "gate_spacing": 0.2} | switches, "train": {"queries": QUERIES}}
 
 
 METHODS = {

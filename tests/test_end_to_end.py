@@ -11,7 +11,7 @@ from tiny import SETTINGS, quick_training
 
 from avatar.canonical.canonicalizer import CanonicalizerConfig
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.posed import DrawConfig
+from avatar.canonical.scans import DrawConfig
 from avatar.checks import AvatarError, DataError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import split_outfit
@@ -22,11 +22,11 @@ from avatar.io.motions import write_motion
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, CycleConfig
 from avatar.methods.settings import MethodChoice
-from avatar.pipeline.comparison import CompareConfig, compare
-from avatar.pipeline.demo import DemoConfig, demo
+from avatar.pipeline.experiments import DemoConfig, demo
+from avatar.pipeline.reporting import CompareConfig, compare
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, export, mesh
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 pytestmark = pytest.mark.slow
 METRICS = ["cd_point", "cd_pop", "normal_l1", "penetration_share"]

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from avatar.arguments import known_options
-from avatar.config import CONF, register
+from avatar.arguments import help_text, known_options, main_option, meanings
+from avatar.config import register
 from avatar.declared import declared
-from avatar.help import help_text, main_option, meanings
-from avatar.verbs import SHARED, VERBS
+from avatar.verbs import OPTIONS, SHARED, VERBS
 
 ROOT = Path(__file__).parents[1]
-WITH_OPTIONS = [verb for verb, entry in VERBS.items() if entry.options]
+WITH_OPTIONS = list(OPTIONS)
 SECONDS = 2.0  # of processor time
 
 
@@ -42,26 +41,35 @@ def test_help_needs_neither_torch_nor_two_seconds(verb):
 
 
 def test_a_mistake_is_found_before_torch_is_imported():
-    for words in (("train", "train.stepz=1"), ("train", "train.steps=many"), ("predict", "run=nowhere")):
-        code, _, err, _ = ask(*words)
-        assert code == 2 and " torch\n" not in err
+    for verb, word, message in (
+        ("train", "train.stepz=1", "train.stepz: no such option."),
+        ("train", "train.steps=many", "train.steps: expected int, got 'many'"),
+        ("train", "outfit=nowhere", "nowhere: no such outfit. There are: dress, tee."),
+        ("demo", "outfit=[dress,coat]", "coat: no such outfit."),
+        ("fit", "run=nowhere", "no such file."),
+        ("predict", "run=nowhere", "no such file."),
+    ):
+        before = children_seconds()
+        code, _, err, after = ask(verb, word)
+        assert code == 2 and " torch\n" not in err and message in err
+        assert after - before < SECONDS
 
 
 @pytest.mark.parametrize("verb", WITH_OPTIONS)
 def test_the_options_that_matter_exist_and_mean_something(verb):
     register(verb)
-    options, choices = known_options(verb, [], CONF)
+    options, choices = known_options(verb, [])
     known = meanings(declared(VERBS[verb].settings), options)
-    assert len(VERBS[verb].options.split()) <= 12
-    for name in VERBS[verb].options.split():
-        assert main_option(name, options, choices, known, CONF)[1], name
+    assert VERBS[verb].settings and len(OPTIONS[verb].split()) <= 12
+    for name in OPTIONS[verb].split():
+        assert main_option(name, options, choices, known)[1], name
 
 
 def test_shared_meanings_are_of_options_that_lack_one():
     known: dict[str, list[str]] = {name: [] for name in SHARED}
     for verb in WITH_OPTIONS:
         register(verb)
-        options, _ = known_options(verb, [], CONF)
+        options, _ = known_options(verb, [])
         for name, meaning in meanings(declared(VERBS[verb].settings), options).items():
             known.setdefault(name, []).append(meaning)
     assert all(known[name].count(meaning) > 1 for name, meaning in SHARED.items() if name != "seed")
@@ -69,7 +77,7 @@ def test_shared_meanings_are_of_options_that_lack_one():
 
 def test_help_shows_what_the_command_line_chooses():
     register("train")
-    text = help_text("train", VERBS["train"], ["method=pop", "train.minutes=3"], CONF)
+    text = help_text("train", VERBS["train"], ["method=pop", "train.minutes=3"])
     assert re.search(r"\n  method=pop +POP: features in the UV plane", text) and "\n  train.minutes=3  " in text
     assert "\n    closet_learned    CloSET skinned by" in text and "\n      map_size: 64" in text
     assert "\n      chamfer: plane  # point, plane\n" in text and "method_size" not in text and "_defaults" not in text

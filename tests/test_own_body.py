@@ -16,7 +16,7 @@ from avatar.data.layouts import find_outfit
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.records import Motion
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]

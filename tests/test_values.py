@@ -10,11 +10,12 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from avatar.arguments import tidy_arguments
+from avatar.arguments import TextOption, text_options, tidy_arguments
 from avatar.checks import AvatarError
 from avatar.config import CONF, register
 from avatar.declared import declared
-from avatar.values import FileName, TextOption, option, text_options
+from avatar.invocation import option
+from avatar.settings import FileName
 from avatar.verbs import VERBS
 
 LETTERS = r"""
@@ -28,7 +29,7 @@ LIKE_QUOTES = ["'q'", '"q"', "~", "~/a"]  # or like the home folder: as they are
 
 def tidy(verb: str, *words: str) -> list[str]:
     """Words of a command line as Hydra gets them."""
-    return tidy_arguments(list(words), texts=text_options(declared(VERBS[verb].settings)))
+    return tidy_arguments(list(words), text_options(declared(VERBS[verb].settings)))
 
 
 def read(verb: str, *words: str) -> dict:

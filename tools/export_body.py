@@ -3,8 +3,7 @@
 import argparse
 from pathlib import Path
 
-from avatar.body.anny import Phenotype, anny_template, t_pose_from_bind
-from avatar.body.open import write_open_bodies
+from avatar.body.open import Phenotype, anny_template, t_pose_from_bind, write_open_bodies
 
 SHAPES = {
     "female": Phenotype(gender=1.0, height=0.5, weight=0.45),

@@ -24,14 +24,9 @@ ENTRY_LIMIT = 10**8  # entries of a matrix that is stored sparse
 def read_pickled_arrays(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> dict[str, np.ndarray]:
     """Named arrays of a pickled dictionary, such as an SMPL body model; other keys are never looked at.
 
-    Knows arrays of numpy, matrices of scipy.sparse and arrays of chumpy, as Python 2 or 3 wrote them.
-
-    Args:
-        path: the pickle.
-        required: keys that must be there.
-        optional: keys that are read where present.
-
-    Raises `DataError` for a missing, damaged, oversized or hostile file, missing keys, or keys that hold no numbers.
+    Knows arrays of numpy, matrices of scipy.sparse and arrays of chumpy, as Python 2 or 3 wrote them. Raises
+    `DataError` for a missing, damaged, oversized or hostile file, missing ``required`` keys, or keys that hold no
+    numbers.
     """
     required = tuple(required)
     if not path.is_file():
@@ -69,115 +64,82 @@ class Inert:
     def __setstate__(self, state: Any) -> None:
         self.state = state
 
-    def array(self) -> np.ndarray:
-        """The numbers this object stands for."""
-        raise AvatarError(f"{type(self).__name__} stands for no array")
+
+def as_array(value: Any) -> np.ndarray:
+    """The numbers of a stand-in, or of a plain list."""
+    read = KNOWN[type(value).__name__][0] if isinstance(value, Inert) else np.asarray
+    if read is None:
+        raise AvatarError(f"{type(value).__name__} stands for no array")
+    array = read(value)
+    if array.dtype.kind not in "biuf":
+        raise AvatarError(f"not numbers but {array.dtype}")
+    return array
 
 
-class PickledBytes(Inert):
-    """Stand-in for _codecs.encode, in which Python 3 wraps bytes for old pickles."""
+def plain_dtype(dtype: Inert) -> np.dtype:
+    """The number type with its byte order that a dtype's stand-in describes; no other type is known."""
+    code, order = dtype.arguments[0], dtype.state[1] if dtype.state else "="
+    if not re.fullmatch(r"[biuf][1248]", code) or order not in ("<", ">", "=", "|"):
+        raise AvatarError(f"not numbers but {code}")
+    return np.dtype(code).newbyteorder(order)
 
 
-class PickledDtype(Inert):
-    """Stand-in for numpy.dtype."""
-
-    def plain(self) -> np.dtype:
-        """The number type with its byte order; no other type is known."""
-        code, order = self.arguments[0], self.state[1] if self.state else "="
-        if not re.fullmatch(r"[biuf][1248]", code) or order not in ("<", ">", "=", "|"):
-            raise AvatarError(f"not numbers but {code}")
-        return np.dtype(code).newbyteorder(order)
+def read_array(stored: Inert) -> np.ndarray:
+    """An array of numpy, its bytes read as plain numbers."""
+    _, shape, dtype, fortran, raw = stored.state
+    raw = raw.arguments[0] if isinstance(raw, Inert) else raw  # of _codecs.encode, by which Python 3 writes old pickles
+    data = raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2 wrote bytes as text
+    return np.frombuffer(data, plain_dtype(dtype)).reshape(shape, order="F" if fortran else "C")
 
 
-class PickledArray(Inert):
-    """Stand-in for numpy.ndarray and for the function that makes one."""
-
-    def array(self) -> np.ndarray:
-        """The array, its bytes read as plain numbers."""
-        _, shape, dtype, fortran, raw = self.state
-        if isinstance(raw, PickledBytes):
-            raw = raw.arguments[0]
-        data = raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2 wrote bytes as text
-        return np.frombuffer(data, dtype.plain()).reshape(shape, order="F" if fortran else "C")
+def read_buffer(stored: Inert) -> np.ndarray:
+    """An array of pickle protocol 5."""
+    raw, dtype, shape, order = stored.arguments
+    return np.frombuffer(raw, plain_dtype(dtype)).reshape(shape, order=order)
 
 
-class PickledBuffer(Inert):
-    """Stand-in for numpy's _frombuffer, which makes arrays of pickle protocol 5."""
-
-    def array(self) -> np.ndarray:
-        """The array, its bytes read as plain numbers."""
-        raw, dtype, shape, order = self.arguments
-        return np.frombuffer(raw, dtype.plain()).reshape(shape, order=order)
-
-
-class PickledColumns(Inert):
-    """Stand-in for scipy's csc_matrix."""
-
-    def array(self) -> np.ndarray:
-        """The dense matrix."""
-        rows, columns = self.state["_shape"]
-        if not 0 < rows * columns <= ENTRY_LIMIT:
-            raise AvatarError(f"a sparse matrix of {rows} x {columns} is too large")
-        values, inner, starts = (as_array(self.state[key]) for key in ("data", "indices", "indptr"))
-        outer = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-        dense = np.zeros((rows, columns), values.dtype)
-        np.add.at(dense, self.places(inner, outer), values)
-        return dense
-
-    def places(self, inner: np.ndarray, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each stored entry."""
-        return inner, outer
+def read_sparse(stored: Inert) -> np.ndarray:
+    """A matrix of scipy as a dense one."""
+    rows, columns = stored.state["_shape"]
+    if not 0 < rows * columns <= ENTRY_LIMIT:
+        raise AvatarError(f"a sparse matrix of {rows} x {columns} is too large")
+    values, inner, starts = (as_array(stored.state[key]) for key in ("data", "indices", "indptr"))
+    outer = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    places = (inner, outer) if type(stored).__name__ == "csc_matrix" else (outer, inner)
+    dense = np.zeros((rows, columns), values.dtype)
+    np.add.at(dense, places, values)  # which checks every index; scipy's own code trusts some starts
+    return dense
 
 
-class PickledRows(PickledColumns):
-    """Stand-in for scipy's csr_matrix."""
-
-    def places(self, inner: np.ndarray, outer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of each stored entry."""
-        return outer, inner
+def read_selection(stored: Inert) -> np.ndarray:
+    """chumpy's entries of another array, in another shape."""
+    entries = as_array(stored.state["a"]).ravel()[as_array(stored.state["idxs"])]
+    return entries.reshape(stored.state["preferred_shape"]) if "preferred_shape" in stored.state else entries
 
 
-class PickledChumpy(Inert):
-    """Stand-in for chumpy.ch.Ch, whose value is its attribute x."""
-
-    def array(self) -> np.ndarray:
-        """The value."""
-        return as_array(self.state["x"])
-
-
-class PickledSelection(Inert):
-    """Stand-in for chumpy.reordering.Select: entries of another array, in another shape."""
-
-    def array(self) -> np.ndarray:
-        """The entries."""
-        entries = as_array(self.state["a"]).ravel()[as_array(self.state["idxs"])]
-        return entries.reshape(self.state["preferred_shape"]) if "preferred_shape" in self.state else entries
+def read_object(stored: Inert) -> np.ndarray:
+    """An object that Python 2 made of a class, whose stand-in gets its state."""
+    twin = stored.arguments[0]()
+    twin.state = stored.state
+    return as_array(twin)
 
 
-class PickledObject(Inert):
-    """Stand-in for copyreg._reconstructor, by which Python 2 makes an object of a class."""
-
-    def array(self) -> np.ndarray:
-        """The value of the stand-in of that class, with this object's state."""
-        twin = self.arguments[0]()
-        twin.state = self.state
-        return twin.array()
-
-
-STAND_INS = {
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): PickledArray for core in ("core", "_core")},
-    **{(f"numpy.{core}.multiarray", "scalar"): Inert for core in ("core", "_core")},
-    **{(f"numpy.{core}.numeric", "_frombuffer"): PickledBuffer for core in ("core", "_core")},
-    ("numpy", "ndarray"): PickledArray,
-    ("numpy", "dtype"): PickledDtype,
-    **{(f"scipy.sparse.{module}", "csc_matrix"): PickledColumns for module in ("csc", "_csc")},
-    **{(f"scipy.sparse.{module}", "csr_matrix"): PickledRows for module in ("csr", "_csr")},
-    ("chumpy.ch", "Ch"): PickledChumpy,
-    ("chumpy.reordering", "Select"): PickledSelection,
-    **{(module, "_reconstructor"): PickledObject for module in ("copy_reg", "copyreg")},
-    **{(module, "object"): Inert for module in ("__builtin__", "builtins")},
-    ("_codecs", "encode"): PickledBytes,
+MULTIARRAY, NUMERIC = (("numpy.core." + part, "numpy._core." + part) for part in ("multiarray", "numeric"))
+KNOWN = {  # all that a pickle may name: what reads an object of that name, and the modules it may be in
+    "_reconstruct": (read_array, *MULTIARRAY),
+    "_frombuffer": (read_buffer, *NUMERIC),
+    "ndarray": (read_array, "numpy"),
+    "csc_matrix": (read_sparse, "scipy.sparse.csc", "scipy.sparse._csc"),
+    "csr_matrix": (read_sparse, "scipy.sparse.csr", "scipy.sparse._csr"),
+    "Ch": (lambda stored: as_array(stored.state["x"]), "chumpy.ch"),  # chumpy's plain array
+    "Select": (read_selection, "chumpy.reordering"),
+    "_reconstructor": (read_object, "copy_reg", "copyreg"),
+    "dtype": (None, "numpy"),
+    "scalar": (None, *MULTIARRAY),
+    "object": (None, "__builtin__", "builtins"),
+    "encode": (None, "_codecs"),
 }
+STAND_INS = {name: type(name, (Inert,), {}) for name in KNOWN}
 
 
 class InertUnpickler(pickle._Unpickler):
@@ -188,14 +150,6 @@ class InertUnpickler(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> type[Inert]:
         """The stand-in of a name; refuses any other name."""
-        if (module, name) not in STAND_INS:
+        if module not in KNOWN.get(name, ())[1:]:
             raise pickle.UnpicklingError(f"refused {module}.{name}, which has no place in a file of arrays")
-        return STAND_INS[module, name]
-
-
-def as_array(value: Any) -> np.ndarray:
-    """The numbers of a stand-in, or of a plain list."""
-    array = value.array() if isinstance(value, Inert) else np.asarray(value)
-    if array.dtype.kind not in "biuf":
-        raise AvatarError(f"not numbers but {array.dtype}")
-    return array
+        return STAND_INS[name]

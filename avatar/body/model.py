@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.body.skinning import blend_transforms, chain_transforms, check_parents
-from avatar.checks import AvatarError, check_finite, check_shape
+from avatar.checks import AvatarError, check_faces, check_finite, check_shape
 from avatar.geometry.transforms import (
     assemble_transform,
     invert_affine,
@@ -36,6 +36,12 @@ class BodyModel(nn.Module):
     out is posed_from_canonical, and the skinned bind shape is what lies under all of them, so a body bound in an
     A-pose keeps its good shoulders. Vertex transforms are therefore not the joint transforms blended by the weights,
     unless bind and canonical pose are one.
+
+    A body has ``zero_from_bind (J, 4, 4)``, the rigid motion of each joint from bind to the T-pose (identity if None),
+    a ``canonical_pose (J, 3)``, axis-angle relative to the T-pose (zero if None), and maybe ``pose_directions (V, 3,
+    9 (J - 1))``, pose blendshapes: the displacement of the bind vertices, metres, for each entry of ``R - I`` of each
+    joint but the root (SMPL's ``posedirs``). Raises `AvatarError` on shapes that do not fit, non-finite values, or
+    weights whose rows do not sum to 1.
     """
 
     def __init__(
@@ -45,42 +51,27 @@ class BodyModel(nn.Module):
         canonical_pose: Tensor | None = None,
         pose_directions: Tensor | None = None,
     ):
-        """Builds a body from its bind-pose template.
-
-        Args:
-            bind: vertices, joints and skinning weights in the bind pose.
-            zero_from_bind: ``(J, 4, 4)`` rigid motion of each joint from bind to the T-pose; identity if None.
-            canonical_pose: ``(J, 3)`` axis-angle pose of the canonical space, relative to the T-pose; zero if None.
-            pose_directions: ``(V, 3, 9 (J - 1))`` pose blendshapes: displacement of the bind vertices, metres, for
-                each entry of ``R - I`` of each joint but the root (SMPL's ``posedirs``); none if None.
-
-        Raises `AvatarError` on shapes that do not fit, non-finite values, or weights whose rows do not sum to 1.
-        """
         super().__init__()
         dims = check_bind(bind)
         like, joints = bind.vertices, dims["J"]
         if zero_from_bind is None:
             zero_from_bind = torch.eye(4, dtype=like.dtype, device=like.device).expand(joints, 4, 4)
-        if canonical_pose is None:
-            canonical_pose = like.new_zeros(joints, 3)
+        canonical_pose = like.new_zeros(joints, 3) if canonical_pose is None else canonical_pose.to(like)
         check_shape("zero_from_bind", zero_from_bind, "J 4 4", J=joints)
         check_shape("canonical_pose", canonical_pose, "J 3", J=joints)
         if pose_directions is not None:
             check_shape("pose_directions", pose_directions, "V 3 P", V=dims["V"], P=9 * (joints - 1))
             check_finite("pose_directions", pose_directions)
             pose_directions = pose_directions.clone()
-
         self.parents, self.joint_names = tuple(bind.parents), tuple(bind.joint_names)
         self.register_buffer("pose_directions", pose_directions, persistent=False)
-        canonical_pose = canonical_pose.to(like)
         zero_joints = transform_points(zero_from_bind, bind.joints)
         canonical_from_zero = chain_transforms(canonical_pose[None], zero_joints, self.parents)[0]
         canonical_from_bind = canonical_from_zero @ zero_from_bind
         vertex_canonical_from_bind = blend_transforms(bind.weights, canonical_from_bind)
         corrected = bind.vertices + self.pose_displacements(canonical_pose[None])[0]
         for name, value in {
-            "faces": bind.faces,
-            "weights": bind.weights,
+            **{name: getattr(bind, name) for name in ("faces", "weights", "uv", "uv_faces")},
             "canonical_pose": canonical_pose,
             "bind_vertices": bind.vertices,
             "bind_joints": bind.joints,
@@ -92,25 +83,15 @@ class BodyModel(nn.Module):
             "canonical_vertices": transform_points(vertex_canonical_from_bind, corrected),
             "canonical_joints": transform_points(canonical_from_bind, bind.joints),
             "canonical_from_bind": canonical_from_bind,
-            "uv": bind.uv,
-            "uv_faces": bind.uv_faces,
         }.items():
             self.register_buffer(name, None if value is None else value.clone(), persistent=False)
 
     @property
     def template(self) -> Template:
         """The body at rest in its canonical pose."""
-        return Template(
-            self.canonical_vertices,
-            self.faces,
-            self.weights,
-            self.canonical_joints,
-            self.parents,
-            self.joint_names,
-            self.canonical_from_bind,
-            self.uv,
-            self.uv_faces,
-        )
+        names = ("faces", "weights", "parents", "joint_names", "canonical_from_bind", "uv", "uv_faces")
+        kept = {name: getattr(self, name) for name in names}
+        return Template(vertices=self.canonical_vertices, joints=self.canonical_joints, **kept)
 
     def with_canonical_pose(self, canonical_pose: Tensor) -> BodyModel:
         """The same body with another canonical space, ``(J, 3)`` axis-angle relative to the T-pose."""
@@ -129,17 +110,11 @@ class BodyModel(nn.Module):
         return (features @ self.pose_directions.flatten(0, 1).T).unflatten(-1, (-1, 3))
 
     def forward(self, pose: Tensor, translation: Tensor | None = None) -> PosedBody:
-        """Poses the body.
+        """Poses the body, differentiably in pose and translation.
 
-        A vertex transform poses the canonical vertex, pose blendshapes included: what they
-        add since the canonical pose lies in its translation.
-
-        Args:
-            pose: ``(B, J, 3)`` axis-angle, radians, relative to the parent and to the T-pose.
-            translation: ``(B, 3)`` metres, added last (SMPL's ``trans``); zero if None.
-
-        Returns:
-            `PosedBody`; differentiable in pose and translation.
+        ``pose (B, J, 3)`` is axis-angle, radians, relative to the parent and to the T-pose; ``translation (B, 3)``
+        metres is added last (SMPL's ``trans``). A vertex transform poses the canonical vertex, pose blendshapes
+        included: what they add since the canonical pose lies in its translation.
         """
         dims = check_shape("pose", pose, "B J 3", J=len(self.parents))
         posed_from_zero = chain_transforms(pose, self.zero_joints, self.parents)
@@ -154,41 +129,27 @@ class BodyModel(nn.Module):
         if self.pose_directions is not None:
             vertices = self.bind_vertices + self.pose_displacements(pose)
             added = transform_directions(posed_from_bind, vertices - self.corrected_bind_vertices)
-            vertex_transforms = assemble_transform(
-                vertex_transforms[..., :3, :3], vertex_transforms[..., :3, 3] + added
-            )
-        return PosedBody(
-            vertices=transform_points(posed_from_bind, vertices),
-            joint_transforms=posed_from_zero @ self.zero_from_canonical,
-            vertex_transforms=vertex_transforms,
-        )
+            shift = vertex_transforms[..., :3, 3] + added
+            vertex_transforms = assemble_transform(vertex_transforms[..., :3, :3], shift)
+        joint_transforms = posed_from_zero @ self.zero_from_canonical
+        return PosedBody(transform_points(posed_from_bind, vertices), joint_transforms, vertex_transforms)
 
 
 def check_bind(bind: Template) -> dict[str, int]:
-    """Refuses a template that cannot be posed, and returns its sizes V and J.
-
-    Raises `AvatarError` naming the field, what was expected and what came.
-    """
+    """Sizes V and J of a template; raises `AvatarError`, naming the field, for one that cannot be posed."""
     dims = check_shape("vertices", bind.vertices, "V 3")
     dims = check_shape("weights", bind.weights, "V J", **dims)
     check_shape("joints", bind.joints, "J 3", **dims)
-    check_shape("faces", bind.faces, "F 3")
     check_parents(bind.parents)
-    for name, entries in (("parents", bind.parents), ("joint_names", bind.joint_names)):
-        if len(entries) != dims["J"]:
-            raise AvatarError(
-                f"{name}: expected {dims['J']} entries, as many as weights has columns, got {len(entries)}."
-            )
+    for name, count in (("parents", len(bind.parents)), ("joint_names", len(bind.joint_names))):
+        if count != dims["J"]:
+            raise AvatarError(f"{name}: expected {dims['J']} entries, as many as weights has columns, got {count}.")
     for name in ("vertices", "weights", "joints"):
         check_finite(name, getattr(bind, name))
     off = float((bind.weights.sum(dim=-1) - 1).abs().max())
     if off > 1e-3 or float(bind.weights.min()) < -1e-6:
         raise AvatarError(f"weights: expected no negative value and rows summing to 1, got a row off by {off:.3g}.")
-    if bind.faces.numel() == 0:
-        raise AvatarError("faces: expected at least one triangle, got none.")
-    lowest, highest = int(bind.faces.min()), int(bind.faces.max())
-    if lowest < 0 or highest >= dims["V"]:
-        raise AvatarError(f"faces: expected indices in [0, {dims['V']}), got {lowest} to {highest}.")
+    check_faces(bind.faces.cpu().numpy(), dims["V"])
     if bind.uv is not None or bind.uv_faces is not None:
         check_atlas(bind.uv, bind.uv_faces, len(bind.faces))
     return dims

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from avatar.body.model import BodyModel, check_bind
 from avatar.body.skinning import blend_transforms, check_parents
 from avatar.checks import AvatarError, DataError, check_shape
 from avatar.geometry.transforms import invert_affine, invert_rigid, transform_points
-from avatar.io.atlases import read_obj_atlas
+from avatar.io.meshes import read_obj_atlas
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import Template
 
@@ -36,9 +38,7 @@ OPTIONAL_KEYS = {
 def sparse_weights(weights: np.ndarray, most: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Skinning weights ``(V, J)`` as joint indices and values ``(V, K)``, largest first, rows summing to 1.
 
-    Args:
-        weights: dense skinning weights.
-        most: influences to keep a vertex; None keeps all that are not zero, which loses nothing.
+    Keeps at most as many influences a vertex as asked for; None keeps all that are not zero, which loses nothing.
     """
     check_shape("weights", weights, "V J")
     count = int((weights > 0).sum(axis=1).max())
@@ -68,8 +68,7 @@ def dense_weights(ids: np.ndarray, values: np.ndarray, joints: int) -> np.ndarra
 def border_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[int, ...]) -> np.ndarray:
     """Where each joint's subtree meets the rest of the body, ``(J, 3)`` float64; NaN where it shares no vertex with it.
 
-    Vertices are averaged by ``s (1 - s)``, s being the sum of their weights over the subtree. Raises `AvatarError` for
-    parents that are no tree, or weights of another shape.
+    Vertices are averaged by ``s (1 - s)``, s being the sum of their weights over the subtree.
     """
     check_parents(parents)
     check_shape("weights", weights, "V J", V=len(vertices), J=len(parents))
@@ -96,22 +95,24 @@ def joint_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[in
     return joints.astype(vertices.dtype)
 
 
-def write_template(path: Path, template: Template) -> None:
-    """Writes a body at rest as a ``template.npz``: sparse weights without loss, and joint positions."""
-    write_arrays(path, _template_arrays(template))
+def write_template(path: Path, template: Template, **others: np.ndarray) -> None:
+    """Writes a body at rest, and other arrays, as a ``template.npz``: weights without loss, and joint positions."""
+    ids, values = sparse_weights(template.weights.cpu().numpy())
+    given = {name: getattr(template, name) for name in ("canonical_from_bind", "uv", "uv_faces", "vertices", "faces")}
+    arrays = {name: value.cpu().numpy() for name, value in given.items() if value is not None}
+    arrays |= {name: arrays[name].astype(np.int32) for name in ("uv_faces", "faces") if name in arrays}
+    arrays |= {"weight_joints": ids, "weight_values": values, "joints": template.joints.cpu().numpy()}
+    arrays |= {"parents": np.array(template.parents, np.int32), "joint_names": np.array(template.joint_names)}
+    write_arrays(path, arrays | others)
 
 
 def read_template(path: Path) -> Template:
     """The body at rest that a ``template.npz`` holds, float32; file and errors as in `packed_body`."""
     arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
-    try:
+    with data_errors(path):
         template = _template(arrays, arrays["vertices"], arrays.get("joints"))
-        if "canonical_from_bind" in arrays:
-            template = replace(template, canonical_from_bind=float32_tensor(arrays["canonical_from_bind"]))
         check_bind(template)
-    except AvatarError as error:
-        raise DataError(path, str(error)) from error
-    return template
+        return replace(template, canonical_from_bind=float32_tensor(arrays.get("canonical_from_bind")))
 
 
 def write_body(path: Path, body: BodyModel) -> None:
@@ -122,7 +123,7 @@ def write_body(path: Path, body: BodyModel) -> None:
     at_rest = body.with_canonical_pose(torch.zeros_like(body.canonical_pose)).template
     kept = {key: getattr(body, key) for key in (*BIND_KEYS, "pose_directions")}
     arrays = {key: value.cpu().numpy() for key, value in kept.items() if value is not None}
-    write_arrays(path, _template_arrays(at_rest) | arrays)
+    write_template(path, at_rest, **arrays)
 
 
 def packed_body(path: Path) -> BodyModel:
@@ -140,17 +141,24 @@ def packed_body(path: Path) -> BodyModel:
     arrays = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
     bound = [key for key in BIND_KEYS if key in arrays]
     directions = float32_tensor(arrays.get("pose_directions"))
-    try:
-        if not bound:
-            at_rest = _template(arrays, arrays["vertices"], arrays.get("joints"))
-            zero_from_bind = float32_tensor(arrays.get("canonical_from_bind"))
-            return BodyModel(_bind_of(at_rest, zero_from_bind), zero_from_bind, pose_directions=directions)
-        if len(bound) < len(BIND_KEYS):
+    with data_errors(path):
+        if 0 < len(bound) < len(BIND_KEYS):
             raise AvatarError(f"bind pose: expected all of {', '.join(BIND_KEYS)} or none, got {', '.join(bound)}.")
-        bind = _template(arrays, arrays["bind_vertices"], arrays["bind_joints"])
-        return BodyModel(bind, float32_tensor(arrays["zero_from_bind"]), pose_directions=directions)
-    except (AvatarError, torch.linalg.LinAlgError) as error:  # transforms that cannot be inverted
-        raise DataError(path, str(error)) from error
+        if bound:
+            bind = _template(arrays, arrays["bind_vertices"], arrays["bind_joints"])
+            return BodyModel(bind, float32_tensor(arrays["zero_from_bind"]), pose_directions=directions)
+        at_rest = _template(arrays, arrays["vertices"], arrays.get("joints"))
+        zero_from_bind = float32_tensor(arrays.get("canonical_from_bind"))
+        return BodyModel(_bind_of(at_rest, zero_from_bind), zero_from_bind, pose_directions=directions)
+
+
+@contextmanager
+def data_errors(path: Path, hint: str = "") -> Iterator[None]:
+    """Errors within the block become `DataError` of a file; transforms that cannot be inverted are among them."""
+    try:
+        yield
+    except (AvatarError, torch.linalg.LinAlgError) as error:
+        raise DataError(path, str(error).removeprefix(f"{path}: "), hint) from error
 
 
 def holds_template(path: Path) -> bool:
@@ -163,20 +171,14 @@ def holds_template(path: Path) -> bool:
 
 
 def add_atlas(source: Path, target: Path, uv: Path) -> None:
-    """Copies a ``template.npz`` with the UV atlas that an OBJ file has for its mesh.
-
-    Raises `DataError` for an invalid template or OBJ, or two of different meshes.
-    """
+    """Copies a ``template.npz`` with the UV atlas that an OBJ file has for its mesh; errors as in `atlas_arrays`."""
     packed_body(source)
     arrays = read_arrays(source, REQUIRED_KEYS, OPTIONAL_KEYS)
     write_arrays(target, arrays | atlas_arrays(uv, arrays["faces"], len(arrays["vertices"])))
 
 
 def atlas_arrays(uv: Path, faces: np.ndarray, vertices: int) -> dict[str, np.ndarray]:
-    """The UV atlas of an OBJ file as the arrays of a body's file.
-
-    Raises `DataError` for an OBJ without texture coordinates or of another mesh.
-    """
+    """The UV atlas of an OBJ file as a body's arrays; `DataError` without texture coordinates or of another mesh."""
     atlas = read_obj_atlas(uv, faces, vertices)
     if atlas is None:
         raise DataError(uv, "it has no texture coordinates.", "Export it with UVs (lines that begin with vt).")
@@ -196,24 +198,6 @@ def _bind_of(at_rest: Template, zero_from_bind: Tensor | None) -> Template:
     )
 
 
-def _template_arrays(template: Template) -> dict[str, np.ndarray]:
-    """A template as the arrays of its file."""
-    ids, values = sparse_weights(template.weights.cpu().numpy())
-    given = {name: getattr(template, name) for name in ("canonical_from_bind", "uv", "uv_faces")}
-    arrays = {name: value.cpu().numpy() for name, value in given.items() if value is not None}
-    if "uv_faces" in arrays:
-        arrays["uv_faces"] = arrays["uv_faces"].astype(np.int32)
-    return arrays | {
-        "vertices": template.vertices.cpu().numpy(),
-        "faces": template.faces.cpu().numpy().astype(np.int32),
-        "weight_joints": ids,
-        "weight_values": values,
-        "joints": template.joints.cpu().numpy(),
-        "parents": np.array(template.parents, np.int32),
-        "joint_names": np.array(template.joint_names),
-    }
-
-
 def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.ndarray | None) -> Template:
     """A template of a file's arrays, with the vertices and joints of one of its poses."""
     parents = tuple(int(parent) for parent in arrays["parents"])
@@ -225,16 +209,16 @@ def _template(arrays: dict[str, np.ndarray], vertices: np.ndarray, joints: np.nd
         raise AvatarError("weights: expected `weights`, or `weight_joints` and `weight_values`, got neither.")
     if joints is None:
         joints = joint_positions(vertices, weights, parents)
-    atlas = {key: kind for key, kind in (("uv", np.float32), ("uv_faces", np.int64)) if key in arrays}
-    return Template(
-        vertices=torch.from_numpy(vertices.astype(np.float32)),
-        faces=torch.from_numpy(arrays["faces"].astype(np.int64)),
-        weights=torch.from_numpy(weights),
-        joints=torch.from_numpy(joints.astype(np.float32)),
-        parents=parents,
-        joint_names=tuple(str(name) for name in arrays["joint_names"]),
-        **{key: torch.from_numpy(arrays[key].astype(kind)) for key, kind in atlas.items()},
-    )
+    kept = {key: arrays.get(key) for key in ("joint_names", "faces", "uv", "uv_faces")}
+    return template_of(parents, vertices=vertices, weights=weights, joints=joints, **kept)
+
+
+def template_of(parents: Iterable[int], joint_names: Iterable[str], **arrays: np.ndarray | None) -> Template:
+    """A template of arrays by the names of its fields, float32."""
+    whole = {name: arrays.pop(name) for name in ("faces", "uv_faces")}
+    tensors = {name: ids if ids is None else torch.from_numpy(ids.astype(np.int64)) for name, ids in whole.items()}
+    tensors |= {name: float32_tensor(array) for name, array in arrays.items()}
+    return Template(parents=tuple(map(int, parents)), joint_names=tuple(map(str, joint_names)), **tensors)
 
 
 def float32_tensor(array: np.ndarray | None) -> Tensor | None:

@@ -11,9 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avatar.body.anny import Phenotype, anny_body
 from avatar.body.model import BodyModel
-from avatar.body.open import open_body
+from avatar.body.open import Phenotype, anny_body, open_body
 from avatar.body.packed import holds_template, packed_body
 from avatar.body.smpl import DOWNLOAD_PAGES, converted_kind, smpl_body, way_to_file
 from avatar.checks import AvatarError, unknown_name
@@ -38,8 +37,7 @@ class BodyConfig:
         if self.name not in BODIES:
             raise unknown_name("body.name", self.name, BODIES)
         if self.canonical not in CANONICAL_POSES:
-            known = ", ".join(CANONICAL_POSES)
-            raise AvatarError(f"body.canonical: expected one of {known}, got {self.canonical!r}.")
+            raise unknown_name("body.canonical", self.canonical, CANONICAL_POSES)
         if self.betas and self.name not in DOWNLOAD_PAGES:
             raise AvatarError(f"body.betas: expected none, as a body of kind {self.name} has no such shape.")
         if self.name == "packed" and not self.path:
@@ -49,25 +47,17 @@ class BodyConfig:
 
 
 def load_body(config: BodyConfig) -> BodyModel:
-    """The body a configuration names, float32.
-
-    Raises `AvatarError` for a shape or a setting that does not exist, naming those that do; `DataError` for a missing
-    or damaged file, with the way to a good one.
-    """
+    """The body a configuration names, float32; errors as in `open_body`, `anny_body`, `smpl_body`, `packed_body`."""
     body = BODIES[config.name](config)
     return body.with_canonical_pose(canonical_pose(config.canonical, body.joint_names))
 
 
 def body_of_file(path: Path, settings: dict[str, Any], name: str = "") -> BodyModel:
-    """The body in a file, whichever of this project's commands wrote it.
+    """The body in a file: a converted SMPL, SMPL-H or SMPL-X model, or a ``template.npz`` (see `packed_body`).
 
-    Args:
-        path: a converted SMPL, SMPL-H or SMPL-X model, or a ``template.npz`` (see `packed_body`).
-        settings: options of `BodyConfig` but ``name`` and ``path``; ``model``, if any, is what the file must hold.
-        name: where the settings stand, for messages.
-
-    Raises `AvatarError` for an unknown option; `DataError` for a missing or damaged file or one of another kind, with
-    the command that makes a good one.
+    Settings are options of `BodyConfig` but ``name`` and ``path``; ``model``, if any, is what the file must hold, and
+    ``name`` where they stand, for messages. Raises `AvatarError` for an unknown option; `DataError` for a missing or
+    damaged file or one of another kind, with the command that makes a good one.
     """
     given = dict(settings)
     model = given.pop("model", None) or ("packed" if holds_template(path) else converted_kind(path))
@@ -75,10 +65,7 @@ def body_of_file(path: Path, settings: dict[str, Any], name: str = "") -> BodyMo
 
 
 def canonical_pose(name: str, joint_names: Sequence[str]) -> Tensor:
-    """A canonical pose by name, ``(J, 3)`` axis-angle: ``t``, or ``apart`` with both hips turned outwards.
-
-    Raises `AvatarError` for an unknown name, or a body without the joints it needs.
-    """
+    """A canonical pose of `CANONICAL_POSES`, ``(J, 3)`` axis-angle; `AvatarError` without the joints it needs."""
     if name not in CANONICAL_POSES:
         raise unknown_name("canonical pose", name, CANONICAL_POSES)
     pose = torch.zeros(len(joint_names), 3)
@@ -99,15 +86,12 @@ def canonical_name(body: BodyModel) -> str:
 
 
 def _smpl(config: BodyConfig) -> BodyModel:
-    """A body of the SMPL family."""
     return smpl_body(Path(config.path), config.betas, config.all_joints, kind=config.name)
 
 
 BODIES = {
     "open": lambda config: open_body(config.shape),
     "anny": lambda config: anny_body(config.phenotype),
-    "smpl": _smpl,
-    "smplh": _smpl,
-    "smplx": _smpl,
+    **dict.fromkeys(DOWNLOAD_PAGES, _smpl),
     "packed": lambda config: packed_body(Path(config.path)),
 }

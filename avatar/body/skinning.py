@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.transforms import assemble_transform, invert_affine, rotation_from_axis_angle, transform_points
+from avatar.geometry.transforms import assemble_transform, invert_affine, rotation_from_axis_angle
 
 
 def check_parents(parents: tuple[int, ...]) -> None:
@@ -26,17 +26,10 @@ def tree_distances(parents: tuple[int, ...]) -> Tensor:
 
 
 def chain_transforms(pose: Tensor, joints: Tensor, parents: tuple[int, ...]) -> Tensor:
-    """Rigid motion of each joint's bone from rest to a pose, along the kinematic tree.
+    """Rigid motions ``(B, J, 4, 4)`` posed_from_rest of each joint's bone, along the kinematic tree.
 
-    Joint frames are aligned with the world at rest, as in SMPL: each joint turns its whole subtree about itself.
-
-    Args:
-        pose: ``(B, J, 3)`` axis-angle, radians, relative to the parent.
-        joints: ``(J, 3)`` joint positions at rest, metres.
-        parents: J indices, -1 for the root.
-
-    Returns:
-        ``(B, J, 4, 4)`` posed_from_rest.
+    Joint frames are aligned with the world at rest, as in SMPL: each joint turns its whole subtree about itself, by
+    ``pose (B, J, 3)`` axis-angle, radians, relative to the parent. ``joints (J, 3)`` are positions at rest, metres.
     """
     dims = check_shape("pose", pose, "B J 3")
     check_shape("joints", joints, "J 3", J=dims["J"])
@@ -60,27 +53,11 @@ def skin_transforms(weights: Tensor, joint_transforms: Tensor, canonical_from_bi
 
     Weights blend motions from the pose they were painted in: a point goes back there and on to the pose with the same
     weights, T(w) = (sum_j w_j P_j C_j) (sum_j w_j C_j)^-1, for P posed_from_canonical and C canonical_from_bind.
-    Without ``canonical_from_bind`` this is plain LBS (SCANimate eq. 1).
-
-    Args:
-        weights: ``(B, N, J)`` or ``(N, J)``, rows summing to 1.
-        joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
-        canonical_from_bind: ``(J, 4, 4)`` of the `Template`, or None.
-
-    Returns:
-        ``(B, N, 4, 4)``, differentiable in all of them.
+    Without ``canonical_from_bind (J, 4, 4)`` this is plain LBS (SCANimate eq. 1), whose inverse poses scans back (eq.
+    2). Weights ``(B, N, J)`` or ``(N, J)`` with rows summing to 1 and joint transforms ``(B, J, 4, 4)`` to ``(B, N, 4,
+    4)``, differentiable in all of them.
     """
     if canonical_from_bind is None:
         return blend_transforms(weights, joint_transforms)
     posed_from_bind = blend_transforms(weights, joint_transforms @ canonical_from_bind)
     return posed_from_bind @ invert_affine(blend_transforms(weights, canonical_from_bind))
-
-
-def pose_points(points: Tensor, weights: Tensor, joint_transforms: Tensor) -> Tensor:
-    """Forward LBS of canonical points. ``(B, N, 3)`` or ``(N, 3)``, weights ``(..., N, J)`` to ``(B, N, 3)``."""
-    return transform_points(blend_transforms(weights, joint_transforms), points)
-
-
-def unpose_points(points: Tensor, weights: Tensor, joint_transforms: Tensor) -> Tensor:
-    """Inverse LBS (SCANimate eq. 2): posed points ``(B, N, 3)`` back to canonical space with known weights."""
-    return transform_points(invert_affine(blend_transforms(weights, joint_transforms)), points)

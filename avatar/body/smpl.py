@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,10 @@ from torch import Tensor
 
 from avatar.body.inert_pickle import read_pickled_arrays
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
-from avatar.body.packed import add_atlas, atlas_arrays, float32_tensor, holds_template
+from avatar.body.packed import add_atlas, atlas_arrays, data_errors, float32_tensor, holds_template, template_of
 from avatar.checks import AvatarError, DataError, check_finite, check_shape
 from avatar.geometry.uv import check_atlas
 from avatar.io.npz import read_arrays, write_arrays
-from avatar.records import Template
 
 WRISTS = {"left": SMPL_JOINTS.index("left_wrist"), "right": SMPL_JOINTS.index("right_wrist")}
 HEAD = SMPL_JOINTS.index("head")
@@ -27,15 +27,10 @@ DOWNLOAD_PAGES = {
     "smplh": "https://mano.is.tue.mpg.de",
     "smplx": "https://smpl-x.is.tue.mpg.de",
 }
+MODEL_SHAPES = {"v_template": "V 3", "shapedirs": "V 3 B", "J_regressor": "J V", "weights": "V J"}
 REQUIRED_KEYS = {
-    "kind": "text 1",
-    "v_template": "float V 3",
-    "shapedirs": "float V 3 B",
-    "J_regressor": "float J V",
-    "weights": "float V J",
-    "faces": "int F 3",
-    "parents": "int J",
-    "joint_names": "text J",
+    **{key: f"float {shape}" for key, shape in MODEL_SHAPES.items()},
+    **{"faces": "int F 3", "kind": "text 1", "parents": "int J", "joint_names": "text J"},
 }
 OPTIONAL_KEYS = {"posedirs": "float V 3 P", "uv": "float U 2", "uv_faces": "int F 3"}
 
@@ -43,11 +38,8 @@ OPTIONAL_KEYS = {"posedirs": "float V 3 P", "uv": "float U 2", "uv_faces": "int 
 def _hands(first: int) -> dict[str, int]:
     """Finger joints of both hands and their parents, the first being joint number ``first``."""
     joints: dict[str, int] = {}
-    for side, wrist in WRISTS.items():
-        for finger in FINGERS:
-            for knuckle in (1, 2, 3):
-                number = first + len(joints)
-                joints[f"{side}_{finger}{knuckle}"] = wrist if knuckle == 1 else number - 1
+    for (side, wrist), finger, knuckle in product(WRISTS.items(), FINGERS, (1, 2, 3)):
+        joints[f"{side}_{finger}{knuckle}"] = wrist if knuckle == 1 else first + len(joints) - 1
     return joints
 
 
@@ -74,18 +66,12 @@ def smpl_body(
     canonical_pose: Tensor | None = None,
     kind: str | None = None,
 ) -> BodyModel:
-    """A body of the SMPL family in one shape, float32, with pose blendshapes where the file has them.
+    """A body of the SMPL family from a file of tools/convert_body.py, float32, with pose blendshapes where it has them.
 
-    Args:
-        path: a file written by tools/convert_body.py.
-        betas: shape coefficients in standard deviations, as many as one likes up to those of the file.
-        all_joints: whether to keep hand and face joints. Otherwise their skinning weights go to wrists and head,
-            which is exactly the model with fingers and face in their zero pose.
-        canonical_pose: ``(J, 3)`` axis-angle pose of the canonical space; the T-pose if None.
-        kind: what the file must hold (smpl, smplh, smplx); any if None.
-
-    Raises `DataError` for a missing or damaged file or one of another kind, with the way to a good one; `AvatarError`
-    for more betas than the file has.
+    Shape coefficients ``betas`` are standard deviations, at most as many as the file has. Without ``all_joints`` the
+    skinning weights of hands and face go to wrists and head: exactly the model with fingers and face in their zero
+    pose. ``kind`` is what the file must hold (smpl, smplh, smplx), any if None. Raises `DataError` for a missing or
+    damaged file or one of another kind, with the way to a good one; `AvatarError` for too many betas.
     """
     model = _read_model(path, kind)
     components = model["shapedirs"].shape[-1]
@@ -94,26 +80,24 @@ def smpl_body(
     shape = model["shapedirs"][..., : len(betas)] @ np.asarray(betas, np.float64)
     vertices = model["v_template"] + shape
     joints, weights, posedirs = model["J_regressor"] @ vertices, model["weights"], model.get("posedirs")
-    parents, names = tuple(int(p) for p in model["parents"]), tuple(str(n) for n in model["joint_names"])
+    parents, names = model["parents"], model["joint_names"]
     if not all_joints:
         count = len(SMPL_JOINTS)
         weights, joints = merge_weights(weights, parents, count), joints[:count]
         parents, names = parents[:count], names[:count]
         posedirs = None if posedirs is None else posedirs[..., : 9 * (count - 1)]
-    bind = Template(
-        vertices=float32_tensor(vertices),
-        faces=torch.from_numpy(model["faces"].astype(np.int64)),
-        weights=float32_tensor(weights / weights.sum(axis=1, keepdims=True)),
-        joints=float32_tensor(joints),
-        parents=parents,
-        joint_names=names,
-        uv=float32_tensor(model.get("uv")),
-        uv_faces=torch.from_numpy(model["uv_faces"].astype(np.int64)) if "uv" in model else None,
+    bind = template_of(
+        parents,
+        names,
+        vertices=vertices,
+        faces=model["faces"],
+        weights=weights / weights.sum(axis=1, keepdims=True),
+        joints=joints,
+        uv=model.get("uv"),
+        uv_faces=model.get("uv_faces"),
     )
-    try:
+    with data_errors(path):
         return BodyModel(bind, None, canonical_pose, float32_tensor(posedirs))
-    except AvatarError as error:
-        raise DataError(path, str(error)) from error
 
 
 def merge_weights(weights: np.ndarray, parents: Sequence[int], count: int) -> np.ndarray:
@@ -126,23 +110,15 @@ def merge_weights(weights: np.ndarray, parents: Sequence[int], count: int) -> np
 
 def way_to_file(kind: str, path: Path | None = None) -> str:
     """Where a model is to be had, and the command that makes our file of it."""
-    return (
-        f"Download the {kind} model from {DOWNLOAD_PAGES[kind]} (its licence applies), then run: "
-        f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path)) if path else '<file.npz>'}"
-    )
+    line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path)) if path else '<file.npz>'}"
+    return f"Download the {kind} model from {DOWNLOAD_PAGES[kind]} (its licence applies), then run: {line}"
 
 
 def converted_kind(path: Path) -> str:
-    """The kind of model a converted file holds: smpl, smplh or smplx.
-
-    Raises `DataError` for a missing or damaged file, or one that tools/convert_body.py has not written.
-    """
-    try:
+    """The kind of model (smpl, smplh, smplx) that a file of tools/convert_body.py holds; `DataError` for any other."""
+    line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path))}"
+    with data_errors(path, f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"):
         return str(read_arrays(path, {"kind": "text 1"})["kind"][0])
-    except DataError as error:
-        line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path))}"
-        hint = f"Convert your own SMPL, SMPL-H or SMPL-X file: {line}"
-        raise DataError(path, str(error).removeprefix(f"{path}: "), hint) from error
 
 
 def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
@@ -150,10 +126,8 @@ def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
     hint = way_to_file(kind or "smplx", path)
     if not Path(path).is_file():
         raise DataError(path, f"expected a converted {kind or 'SMPL-family'} body model, there is no such file.", hint)
-    try:
+    with data_errors(path, hint):
         model = read_arrays(path, REQUIRED_KEYS, OPTIONAL_KEYS)
-    except DataError as error:
-        raise DataError(path, str(error).removeprefix(f"{path}: "), hint) from error
     stored = str(model["kind"][0])
     if kind not in (None, stored):
         raise DataError(path, f"expected a {kind} body model, got {stored}.", hint)
@@ -163,34 +137,19 @@ def _read_model(path: Path, kind: str | None) -> dict[str, np.ndarray]:
 
 
 SHAPE_COMPONENTS = {20: 10, 400: 300}  # SMPL-X stores expression blendshapes behind those of shape
-SOURCE_KEYS = {
-    "v_template": "number V 3",
-    "shapedirs": "number V 3 B",
-    "J_regressor": "number J V",
-    "weights": "number V J",
-    "f": "int F 3",
-    "kintree_table": "int 2 J",
-}
+SOURCE_KEYS = {key: f"number {shape}" for key, shape in MODEL_SHAPES.items()}
+SOURCE_KEYS |= {"f": "int F 3", "kintree_table": "int 2 J"}
 OPTIONAL_SOURCE_KEYS = {"posedirs": "number V 3 P", "vt": "number U 2", "ft": "number F 3"}  # vt, ft: an atlas
 
 
 def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> str:
-    """Converts a downloaded SMPL, SMPL-H or SMPL-X file to the plain npz that `smpl_body` reads.
+    """Converts a downloaded SMPL, SMPL-H or SMPL-X file, ``.npz`` or ``.pkl``, to the npz that `smpl_body` reads.
 
-    A UV atlas, which POP and SCALE need, comes from the file where it has one (SMPL-X does), or from an OBJ file of
-    the same mesh with texture coordinates. With such an OBJ a ``template.npz`` of our own may be the source as well:
-    any body then gets an atlas.
-
-    Args:
-        source: the model file, ``.npz`` or ``.pkl``. Code and object arrays in it are never touched.
-        target: the ``.npz`` to write.
-        uv: the OBJ file, if any; it comes before what the source has.
-
-    Returns:
-        The kind of model it is: smpl, smplh, smplx or packed (a ``template.npz``).
-
-    Raises `DataError` naming the file, for a damaged or hostile one, missing keys, or shapes that do not fit;
-    `AvatarError` when the target is not an npz.
+    Code and object arrays in it are never touched. A UV atlas, which POP and SCALE need, comes from the OBJ file ``uv``
+    of the same mesh, or from the file where it has one (SMPL-X does). With such an OBJ a ``template.npz`` of our own
+    may be the source as well: any body then gets an atlas. Gives the kind of model: smpl, smplh, smplx or packed (a
+    ``template.npz``). Raises `DataError` naming the file, for a damaged or hostile one, missing keys, or shapes that do
+    not fit; `AvatarError` when the target is not an npz.
     """
     source, target = Path(source), Path(target)
     if target.suffix != ".npz":
@@ -200,14 +159,10 @@ def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> st
     if uv is not None and source.suffix == ".npz" and holds_template(source):
         add_atlas(source, target, uv)
         return "packed"
-    if source.suffix == ".npz":
-        arrays = read_arrays(source, SOURCE_KEYS, OPTIONAL_SOURCE_KEYS)
-    else:
-        arrays = read_pickled_arrays(source, SOURCE_KEYS, OPTIONAL_SOURCE_KEYS)
-    try:
+    read = read_arrays if source.suffix == ".npz" else read_pickled_arrays
+    arrays = read(source, SOURCE_KEYS, OPTIONAL_SOURCE_KEYS)
+    with data_errors(source):
         plain = _plain_model(arrays if uv is None else {k: v for k, v in arrays.items() if k not in ("vt", "ft")})
-    except AvatarError as error:
-        raise DataError(source, str(error)) from error
     if uv is not None:
         plain |= atlas_arrays(uv, plain["faces"], len(plain["v_template"]))
     write_arrays(target, plain)
@@ -225,9 +180,8 @@ def _plain_model(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     parents = (-1, *(int(parent) for parent in arrays["kintree_table"][0, 1:]))  # the root's is 2^32 - 1
     kinds = [kind for kind in EXTRA_JOINTS if joint_tree(kind)[1] == parents]
     if not kinds:
-        raise AvatarError(
-            f"kintree_table: expected the joints of smpl (24), smplh (52) or smplx (55), got {len(parents)} joints."
-        )
+        known = "smpl (24), smplh (52) or smplx (55)"
+        raise AvatarError(f"kintree_table: expected the joints of {known}, got {len(parents)} joints.")
     if "posedirs" in arrays:
         check_shape("posedirs", arrays["posedirs"], "V 3 P", V=dims["V"], P=9 * (dims["J"] - 1))
     components = SHAPE_COMPONENTS.get(dims["B"], dims["B"]) if kinds[0] == "smplx" else dims["B"]

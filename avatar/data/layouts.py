@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from avatar.body.model import BodyModel
 from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.body.packed import packed_body
 from avatar.body.registry import canonical_pose
-from avatar.checks import AvatarError, DataError
-from avatar.data.fusion import fuse_mesh
-from avatar.data.outfits import Outfit, SurfaceOutfit, outfit_folder, read_outfit_settings
+from avatar.checks import DataError
+from avatar.data.folders import outfit_folder, read_outfit_settings
+from avatar.data.outfits import Outfit
 from avatar.data.packed_layout import PackedOutfit
-from avatar.data.scanner import DressedSurface, ScanConfig, paint, scan_mesh, scan_points
-from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, read_open_garment
+from avatar.data.scanner import DressedSurface, ScanConfig, fuse_mesh, paint, scan_mesh, scan_points
+from avatar.io.frames import OpenGarment, read_canonical_scan, read_open_frame, read_open_garment
+from avatar.io.npz import naming
 from avatar.records import BodyFit, Frame, Scan, Template
 
 
-class OpenOutfit(SurfaceOutfit):
+class OpenOutfit(Outfit):
     """An outfit of the open dataset: ``outfit.yaml``, ``garment.npz`` and frames of cloth and visibility."""
 
     def __init__(self, path: Path, dataset: str = "", scanner: ScanConfig | None = None):
@@ -45,7 +45,6 @@ class OpenOutfit(SurfaceOutfit):
 
     @cached_property
     def body(self) -> BodyModel:
-        """The subject."""
         if self._shape is not None:
             return self._make_body(self._shape)
         path = self.path / "body.npz"
@@ -60,22 +59,15 @@ class OpenOutfit(SurfaceOutfit):
         return self._make_body(MEAN_SHAPE)
 
     def _make_body(self, shape: str) -> BodyModel:
-        """An open body in the outfit's canonical pose."""
-        try:
+        with naming(self.path / "outfit.yaml", prefix="body: "):
             body = open_body(shape)
             return body.with_canonical_pose(canonical_pose(self._canonical, body.joint_names))
-        except DataError:
-            raise
-        except AvatarError as error:
-            raise DataError(self.path / "outfit.yaml", f"body: {error}") from error
 
     def _read_template(self) -> Template:
         return self.body.template
 
     def _read_frame(self, path: Path, split: str, name: str) -> Frame:
-        stored = self._read_open_frame(path)
-        body = self.fit_pose(stored.pose, stored.translation)
-        surface = self._surface(stored, body.vertices)
+        body, surface = self._dress(path)
         scan = fuse_mesh if self.scanner.mesh else scan_points
         return Frame(name, self.name, split, body, scan(surface, self.scanner, f"{self.name}/{name}"))
 
@@ -90,70 +82,88 @@ class OpenOutfit(SurfaceOutfit):
 
     def load_body(self, split: str, name: str) -> BodyFit:
         """The body under a frame, without its scan."""
-        stored = self._read_open_frame(self.frame_path(split, name))
-        return self.fit_pose(stored.pose, stored.translation)
+        return self._dress(self.frame_path(split, name))[0]
 
     def load_surface(self, split: str, name: str) -> DressedSurface:
         """Body and cloth of a frame as one labelled mesh with its visible faces."""
-        stored = self._read_open_frame(self.frame_path(split, name))
-        return self._surface(stored, self.fit_pose(stored.pose, stored.translation).vertices)
+        return self._dress(self.frame_path(split, name))[1]
 
-    def _read_open_frame(self, path: Path) -> OpenFrame:
-        """A stored frame that fits the outfit's body and garment."""
-        stored = read_open_frame(path)
+    def _dress(self, path: Path) -> tuple[BodyFit, DressedSurface]:
+        """The posed body of a frame's file, and body and cloth as one mesh."""
+        stored, template, garment = read_open_frame(path), self.template, self.garment
         expected = {
             "pose": (len(self.body.parents), 3),
-            "cloth": self.garment.canonical.shape,
+            "cloth": garment.canonical.shape,
             "visible_body": (len(self.body.faces),),
-            "visible_cloth": (len(self.garment.faces),),
+            "visible_cloth": (len(garment.faces),),
         }
         for key, shape in expected.items():
             if getattr(stored, key).shape != shape:
                 problem = f"{key}: expected {shape} as body and garment.npz have it, got {getattr(stored, key).shape}."
                 raise DataError(path, problem, "Frame and garment are of different outfits.")
-        return stored
-
-    def _surface(self, stored: OpenFrame, body_vertices: np.ndarray) -> DressedSurface:
-        """Body and cloth as one mesh."""
-        template, garment = self.template, self.garment
-        skin = np.zeros(len(body_vertices), np.uint8)
-        return DressedSurface(
-            vertices=_stack([body_vertices, stored.cloth]),
-            canonical=_stack([template.vertices.numpy(), garment.canonical]),
-            faces=_stack([template.faces.numpy(), garment.faces + len(body_vertices)]),
-            visible=_stack([stored.visible_body, stored.visible_cloth]),
-            labels=_stack([skin, garment.labels]),
-        )
+        body = self.fit_pose(stored.pose, stored.translation)
+        parts = {
+            "vertices": (body.vertices, stored.cloth),
+            "canonical": (template.vertices.numpy(), garment.canonical),
+            "faces": (template.faces.numpy(), garment.faces + len(body.vertices)),
+            "visible": (stored.visible_body, stored.visible_cloth),
+            "labels": (np.zeros(len(body.vertices), np.uint8), garment.labels),
+        }
+        surface = {name: torch.from_numpy(np.concatenate(pair)) for name, pair in parts.items()}
+        return body, DressedSurface(**surface)
 
 
-def _stack(parts: Sequence[np.ndarray]) -> Tensor:
-    """Arrays one after the other, as a tensor."""
-    return torch.from_numpy(np.concatenate(parts))
+class CanonicalOutfit(Outfit):
+    """The frames of an outfit in its canonical space (SCANimate 3.1); their scans are ``<scans>/<split>/<frame>.npz``.
+
+    A frame's body stands at rest under its scan, with identity vertex transforms. What tells the pose stays that of the
+    posed frame: ``pose_vertices``, ``joint_transforms``, ``pose``.
+    """
+
+    def __init__(self, posed: Outfit, scans: Path):
+        super().__init__(posed.path, posed.dataset)
+        self.posed, self.scans = posed, Path(scans)
+
+    @property
+    def body(self) -> BodyModel | None:
+        return self.posed.body
+
+    @property
+    def mean_body(self) -> BodyModel | None:
+        return self.posed.mean_body
+
+    def frame_path(self, split: str, name: str) -> Path:
+        return self.scans / split / super().frame_path(split, name).name
+
+    @cached_property
+    def _still(self) -> np.ndarray:
+        """A vertex transform that moves nothing for each vertex, ``(V, 4, 4)``; one array for all frames."""
+        return np.tile(np.eye(4, dtype=np.float32), (len(self.template.vertices), 1, 1))
+
+    def _read_template(self) -> Template:
+        return self.posed.template
+
+    def _read_frame(self, path: Path, split: str, name: str) -> Frame:
+        if not path.is_file():
+            raise DataError(path, "no canonical scan of this frame.", "Run tools/canonicalize.py to its end.")
+        stored, posed = read_canonical_scan(path), self.posed.load(split, name)
+        body = replace(posed.body, vertices=self.template.vertices.numpy(), vertex_transforms=self._still)
+        return replace(posed, body=body, scan=Scan(stored.points, stored.normals, stored.faces, colors=stored.colors))
 
 
 LAYOUTS = ("open", "packed")
 
 
 def find_outfit(root: Path, dataset: str, outfit: str, scanner: ScanConfig | None = None) -> Outfit:
-    """An outfit by the name of its data set and its own: the embedded ``sample``, ``open``, or packed data.
+    """An outfit by the names of its data set and its own (`outfit_folder`); simulated frames are seen by a scanner.
 
-    Args:
-        root: the data root, with ``<dataset>/<outfit>`` below it.
-        dataset: ``sample`` is the one that comes with the program and needs no root.
-        outfit: the outfit's folder name.
-        scanner: how simulated frames are scanned; a perfect scanner if None. Real scans are as they are.
-
-    Raises `AvatarError` for names that could leave the data root; `DataError` naming the outfits there are, or what is
-    wrong with this one.
+    Raises `AvatarError` for names that could leave the data root; `DataError` for what is not there, or invalid.
     """
     return open_outfit_folder(outfit_folder(root, dataset, outfit), dataset, scanner)
 
 
 def open_outfit_folder(path: Path, dataset: str = "", scanner: ScanConfig | None = None) -> Outfit:
-    """An outfit by its folder; the layout is what ``outfit.yaml`` says, or what its files show.
-
-    Raises `DataError` for an unknown layout, naming those there are.
-    """
+    """An outfit by its folder, of the layout that ``outfit.yaml`` says or its files show; `DataError` for another."""
     path = Path(path)
     shown = "open" if (path / "garment.npz").is_file() else "packed"
     layout = read_outfit_settings(path).get("layout", shown)

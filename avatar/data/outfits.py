@@ -1,4 +1,4 @@
-"""One interface to an outfit on disk, whatever its layout, and finding it by name."""
+"""One interface to an outfit on disk, whatever its layout."""
 
 from __future__ import annotations
 
@@ -8,30 +8,23 @@ from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
 
 from avatar.body.model import BodyModel
-from avatar.checks import SAFE_NAME, AvatarError, DataError, check_name, did_you_mean, sentences
-from avatar.data.consistency import check_joints
-from avatar.data.validation import check_frame, check_pose, check_template
-from avatar.io.documents import read_yaml
+from avatar.checks import AvatarError, DataError, did_you_mean, sentences
+from avatar.data.folders import SPLITS, VALIDATION
+from avatar.data.validation import check_frame, check_joints, check_pose, check_template
 from avatar.io.ledger import digest_of, file_digest, files_digest
-from avatar.records import BodyFit, Frame, Scan, Template
-
-SPLITS = ("train", "test", "interpolation")  # interpolation: unseen poses of the kind that train has
-VALIDATION = "validation"  # training frames that a run held back: a split of `Outfit.with_validation`
-SAMPLE_FOLDER = Path(__file__).parents[1] / "assets" / "sample"
-OUTFIT_FORMAT = "outfit/1"
+from avatar.records import BodyFit, Frame, Template
 
 
 class Outfit(ABC):
     """One person in one set of clothes: frames of scans with the body under them.
 
-    ``name``, ``dataset`` (the folder above), ``path``. `frames` and `load` are what training needs; `resample` is
-    there where the true surface is known.
+    Where the true surface is known, there are ``resample`` and ``load_mesh`` as well (`OpenOutfit`).
     """
 
     def __init__(self, path: Path, dataset: str = ""):
@@ -42,10 +35,7 @@ class Outfit(ABC):
 
     @cached_property
     def template(self) -> Template:
-        """The body at rest in its canonical pose, float32.
-
-        Raises `DataError` for a missing or damaged file, or a body that is not in metres or not at its joints.
-        """
+        """The body at rest in its canonical pose, float32, checked (`check_template`, `check_joints`)."""
         template = self._read_template()
         check_template(template, self.path)
         check_joints(template, self.path)
@@ -54,8 +44,8 @@ class Outfit(ABC):
     def frames(self, split: str) -> tuple[str, ...]:
         """Names of the frames of a split, sorted.
 
-        Raises `AvatarError` for a split that is not in `SPLITS`, nor validation where frames are held back; `DataError`
-        when the split's folder is missing or empty.
+        Raises `AvatarError` for an unknown split, or validation without frames held back; `DataError` for one without
+        frames.
         """
         if split == VALIDATION and self.held_back:
             return self.held_back
@@ -73,10 +63,7 @@ class Outfit(ABC):
         return bool(self._listed[split])
 
     def with_validation(self, names: Sequence[str]) -> Self:
-        """The same outfit with some of its training frames as a split of their own, ``validation``, as well.
-
-        Raises `AvatarError` for a frame that is not among those of training.
-        """
+        """The same outfit with some training frames as a split ``validation`` as well; `AvatarError` for others."""
         for name in names:
             self.frame_path("train", name)
         other = copy(self)
@@ -86,8 +73,7 @@ class Outfit(ABC):
     def load(self, split: str, name: str) -> Frame:
         """One frame, checked: finite, in metres, scan over body.
 
-        Raises `AvatarError` for a frame that is not in the split, naming near ones; `DataError` for a damaged or
-        invalid file.
+        Raises `AvatarError` for a frame that is not in the split, naming near ones; `DataError` for an invalid file.
         """
         path = self.frame_path(split, name)
         frame = self._read_frame(path, split, name)
@@ -101,7 +87,7 @@ class Outfit(ABC):
     def frame_path(self, split: str, name: str) -> Path:
         """The file of one of the outfit's frames. Raises `AvatarError` for a name that is not among them."""
         names = self.frames(split)
-        if name not in (names if split == VALIDATION else self._known[split]):
+        if name not in self._frame_sets.get(split, names):
             near = difflib.get_close_matches(name, names, n=3) or names[:3]
             raise AvatarError(f"frame: {self.name} has no {split} frame {name!r}; there are {', '.join(near)}, ...")
         return self.path / ("train" if split == VALIDATION else split) / f"{name}.npz"
@@ -137,39 +123,30 @@ class Outfit(ABC):
     def fit_pose(self, pose: np.ndarray, translation: np.ndarray | None = None) -> BodyFit:
         """The subject in any pose; what a pose encoder sees of it is in mean shape, with the root at rest.
 
-        Args:
-            pose: ``(J, 3)`` axis-angle, radians, relative to the parent and to the T-pose.
-            translation: ``(3,)`` metres; zero if None.
-
-        Raises `AvatarError` for a pose of other joints, or where the outfit has no body that can be posed.
+        ``pose (J, 3)`` axis-angle, radians, relative to the parent and to the T-pose; ``translation (3,)`` metres, zero
+        if None. Raises `AvatarError` for a pose of other joints, or where the outfit has no body that can be posed.
         """
         body = self.posable_body()
         check_pose(pose, len(body.parents))
-        translation = np.zeros(3, np.float32) if translation is None else np.asarray(translation, np.float32)
+        translation = np.asarray(np.zeros(3) if translation is None else translation, np.float32)
         pose = np.asarray(pose, np.float32)
         turned = torch.from_numpy(pose)[None]
         posed = body(turned, torch.from_numpy(translation)[None])
         rootless = turned.clone()
         rootless[:, 0] = body.canonical_pose[0]
-        return BodyFit(
-            vertices=posed.vertices[0].numpy(),
-            vertex_transforms=posed.vertex_transforms[0].numpy(),
-            joint_transforms=posed.joint_transforms[0].numpy(),
-            pose_vertices=self.mean_body(rootless).vertices[0].numpy(),
-            translation=translation,
-            pose=pose,
-        )
+        parts = {name: value[0].numpy() for name, value in vars(posed).items()}
+        seen = self.mean_body(rootless).vertices[0].numpy()
+        return BodyFit(**parts, pose_vertices=seen, translation=translation, pose=pose)
 
     @cached_property
     def _listed(self) -> dict[str, tuple[str, ...]]:
-        """Frame names by split, as the folders have them."""
         return {
             split: tuple(sorted(p.stem for p in (self.path / split).glob("*.npz") if not p.name.startswith(".")))
             for split in SPLITS
         }
 
     @cached_property
-    def _known(self) -> dict[str, frozenset[str]]:
+    def _frame_sets(self) -> dict[str, frozenset[str]]:
         """The same names for look-ups."""
         return {split: frozenset(names) for split, names in self._listed.items()}
 
@@ -180,60 +157,3 @@ class Outfit(ABC):
     @abstractmethod
     def _read_frame(self, path: Path, split: str, name: str) -> Frame:
         """One frame, from the layout's file."""
-
-
-class SurfaceOutfit(Outfit):
-    """An outfit whose true surface is known, so that it can be sampled at will."""
-
-    @abstractmethod
-    def resample(self, split: str, name: str, points: int, seed: int) -> Scan:
-        """A fresh, perfect sampling of a frame's true visible surface."""
-
-    @abstractmethod
-    def load_mesh(self, split: str, name: str) -> Scan:
-        """What can be seen of a frame as a mesh: a scan with faces."""
-
-
-def read_outfit_settings(path: Path) -> dict[str, Any]:
-    """What an outfit's ``outfit.yaml`` says, or nothing where there is none.
-
-    Raises `DataError` for a file that is not a plain mapping, or of an unknown format.
-    """
-    file = Path(path) / "outfit.yaml"
-    if not file.is_file():
-        return {}
-    settings = read_yaml(file)
-    if settings.get("format", OUTFIT_FORMAT) != OUTFIT_FORMAT:
-        raise DataError(file, f"expected format {OUTFIT_FORMAT}, got {settings['format']}.", "Make the data again.")
-    return settings
-
-
-def outfit_folder(root: Path, dataset: str, outfit: str) -> Path:
-    """The folder of an outfit: ``<root>/<dataset>/<outfit>``, or the embedded one for the dataset ``sample``.
-
-    POP's nesting ``<root>/<dataset>/packed/<outfit>`` is found as well. Raises `AvatarError` for names that could leave
-    the data root; `DataError` for a data set or an outfit that is not there, naming those that are.
-    """
-    check_name("dataset", dataset)
-    check_name("outfit", outfit)
-    parent = SAMPLE_FOLDER if dataset == "sample" else Path(root) / dataset
-    if (parent / "packed").is_dir():
-        parent = parent / "packed"
-    if not parent.is_dir():
-        near = did_you_mean(dataset, ["sample", *(path.name for path in Path(root).glob("*/"))])
-        hint = f"Make it with tools/simulate.py, or put the data there as {parent}/<outfit>/train/*.npz."
-        raise DataError(parent, f"expected the folder of data set {dataset}, there is none.", sentences(near, hint))
-    there = outfit_names(parent)
-    if outfit not in there:
-        hint = sentences(did_you_mean(outfit, there), f"There are: {', '.join(there) or 'none'}.")
-        raise DataError(parent / outfit, "no such outfit.", hint)
-    folder = parent / outfit
-    if not folder.resolve().is_relative_to(parent.resolve()):
-        raise DataError(folder, f"expected a folder inside {parent}, it is a link to {folder.resolve()}.")
-    return folder
-
-
-def outfit_names(parent: Path) -> tuple[str, ...]:
-    """Names of the outfits in a data set's folder: those with a ``train`` or ``test`` folder, sorted."""
-    folders = (p for p in Path(parent).iterdir() if any((p / split).is_dir() for split in SPLITS))
-    return tuple(sorted(p.name for p in folders if SAFE_NAME.fullmatch(p.name)))

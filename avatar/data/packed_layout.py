@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,16 +17,15 @@ from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.body.packed import write_body, write_template
 from avatar.body.registry import body_of_file, canonical_name
 from avatar.body.skinning import blend_transforms, skin_transforms
-from avatar.checks import AvatarError, DataError, check_shape, require
-from avatar.data.consistency import check_posed, check_vertex_transforms
-from avatar.data.outfits import OUTFIT_FORMAT, SPLITS, Outfit, read_outfit_settings
-from avatar.data.validation import check_pose, check_size
+from avatar.checks import DataError, check_shape, require
+from avatar.data.folders import OUTFIT_FORMAT, SPLITS, read_outfit_settings
+from avatar.data.outfits import Outfit
+from avatar.data.validation import check_pose, check_posed, check_size, check_vertex_transforms
 from avatar.geometry.transforms import invert_rigid, transform_points
-from avatar.io.atlases import read_obj_atlas
 from avatar.io.frames import write_manifest
 from avatar.io.ledger import digest_of, file_digest
-from avatar.io.meshes import read_mesh
-from avatar.io.npz import read_arrays, write_arrays, write_whole
+from avatar.io.meshes import read_mesh, read_obj_atlas
+from avatar.io.npz import naming, read_arrays, write_arrays, write_whole
 from avatar.io.points import color_bytes, unit_colors
 from avatar.records import BodyFit, Frame, Scan, Template
 
@@ -33,6 +34,11 @@ log = logging.getLogger(__name__)
 BODY, MEAN = "body", "mean_body"  # keys of outfit.yaml
 BODY_FILES = {BODY: "template.npz", MEAN: "mean.npz"}  # where a body is that outfit.yaml gives no path
 
+# What a file and what a record calls the same
+BODY_KEYS = {"body_verts": "vertices", "vtransf": "vertex_transforms"}
+BODY_KEYS |= {key: key for key in ("joint_transforms", "pose", "translation", "pose_vertices")}
+SCAN_KEYS = {"scan_pc": "points", "scan_n": "normals"}
+SCAN_KEYS |= {f"scan_{key}": key for key in ("faces", "labels", "canonical", "colors")}
 REQUIRED = {"scan_pc": "float M 3", "scan_n": "float M 3"}
 OPTIONAL = {
     "body_verts": "float V 3",
@@ -51,22 +57,18 @@ OPTIONAL = {
 class PackedOutfit(Outfit):
     """Packed frames beside a body of the person who was scanned (docs/data.md has every key).
 
-    The body is what ``outfit.yaml`` names under ``body``, or ``template.npz``: a SMPL, SMPL-H or SMPL-X file converted
-    by ``tools/convert_body.py``, or a template of this project (`packed_body`). Then what a frame lacks is derived:
-    joint transforms from the pose, or from ``vtransf`` by least squares; ``vtransf`` from pose or joint transforms;
-    body vertices from any of them. Where several are there, they must agree. With ``template.obj`` alone nothing is
-    known of the joints, so frames must bring ``body_verts`` and ``vtransf``, and bodies must stand in their root frame
-    already, as those packed by POP do.
+    The body is what ``outfit.yaml`` names, or ``template.npz``. What a frame lacks is derived: joint transforms from
+    the pose, or from ``vtransf`` by least squares; ``vtransf`` from either; body vertices from any of them. What it has
+    must agree. With ``template.obj`` alone nothing is known of the joints: frames must bring ``body_verts`` and
+    ``vtransf``, in their root frame, as those packed by POP do.
     """
 
     @cached_property
     def body(self) -> BodyModel | None:
-        """The body that ``outfit.yaml`` names or ``template.npz`` holds, or None where there is only a mesh."""
         return self._body_of(BODY)
 
     @cached_property
     def mean_body(self) -> BodyModel | None:
-        """The body that ``outfit.yaml`` names as ``mean_body`` or ``mean.npz`` holds; the person's own otherwise."""
         mean, own = self._body_of(MEAN), self.body
         if mean is None or own is None:
             return own
@@ -77,32 +79,28 @@ class PackedOutfit(Outfit):
     @cached_property
     def shared_digest(self) -> str:
         """One hash over the files that the outfit's frames share, bodies elsewhere included."""
-        files = [self._body_file(key) for key in BODY_FILES]
-        return digest_of([super().shared_digest, *(file_digest(file) for file in files if file and file.is_file())])
+        files = [file for file, _ in self._bodies.values()]
+        return digest_of([super().shared_digest, *(file_digest(file) for file in files if file.is_file())])
 
-    def _body_file(self, key: str) -> Path | None:
-        """The file of one of the outfit's bodies; None where nothing speaks of it."""
-        file, said = self.path / BODY_FILES[key], read_outfit_settings(self.path).get(key)
-        if said is None:
-            return file if file.is_file() else None
-        if not isinstance(said, dict) or not isinstance(said.get("path", ""), str):
-            problem = f"{key}: expected a mapping such as {{path: {BODY_FILES[key]}, betas: []}}, got {said}."
-            raise DataError(self.path / "outfit.yaml", problem)
-        return self.path / said["path"] if "path" in said else file
+    @cached_property
+    def _bodies(self) -> dict[str, tuple[Path, dict[str, Any]]]:
+        """File and settings of the outfit's bodies by their keys, without those that nothing speaks of."""
+        found = {}
+        for key, default in BODY_FILES.items():
+            said = read_outfit_settings(self.path).get(key)
+            if said is not None and not (isinstance(said, dict) and isinstance(said.get("path", ""), str)):
+                problem = f"{key}: expected a mapping such as {{path: {default}, betas: []}}, got {said}."
+                raise DataError(self.path / "outfit.yaml", problem)
+            if said is not None or (self.path / default).is_file():
+                settings = dict(said or {})
+                found[key] = self.path / settings.pop("path", default), settings
+        return found
 
     def _body_of(self, key: str) -> BodyModel | None:
-        """One of the outfit's bodies; None where nothing speaks of it."""
-        file = self._body_file(key)
-        if file is None:
+        if key not in self._bodies:
             return None
-        settings = dict(read_outfit_settings(self.path).get(key) or {})
-        settings.pop("path", None)
-        try:
-            return body_of_file(file, settings, f"{key}.")
-        except DataError:
-            raise
-        except AvatarError as error:
-            raise DataError(self.path / "outfit.yaml", str(error)) from error
+        with naming(self.path / "outfit.yaml"):
+            return body_of_file(*self._bodies[key], f"{key}.")
 
     def _read_template(self) -> Template:
         return self.body.template if self.body else _template_of_mesh(self.path / "template.obj")
@@ -111,39 +109,15 @@ class PackedOutfit(Outfit):
         stored = read_arrays(path, REQUIRED, OPTIONAL)
         if self.body is None:
             stored = {key: value for key, value in stored.items() if key not in ("joint_transforms", "pose")}
-        count, joints = len(self.template.vertices), len(self.template.parents)
-        for key, expected in (
-            ("body_verts", count),
-            ("vtransf", count),
-            ("joint_transforms", joints),
-        ):
+        rows = dict.fromkeys(("body_verts", "vtransf"), len(self.template.vertices))
+        for key, expected in (rows | {"joint_transforms": len(self.template.parents)}).items():
             if key in stored and len(stored[key]) != expected:
-                hint = "The frame belongs to another body than the template."
-                raise DataError(
-                    path, f"{key}: expected {expected} rows as in the template, got {len(stored[key])}.", hint
-                )
+                problem = f"{key}: expected {expected} rows as in the template, got {len(stored[key])}."
+                raise DataError(path, problem, "The frame belongs to another body than the template.")
         if "pose" in stored:
             stored["pose"] = _stored_pose(stored["pose"], self.template.joint_names, path)
         stored = {k: v.astype(np.float32) if v.dtype.kind == "f" else v for k, v in stored.items()}
-        normals, colors = stored["scan_n"], stored.get("scan_colors")
-        scan = Scan(
-            points=stored["scan_pc"],
-            normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12),
-            faces=self._scan_faces(stored, path),
-            labels=stored.get("scan_labels"),
-            canonical=stored.get("scan_canonical"),
-            colors=None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu"),
-        )
-        return Frame(name, self.name, split, self._fit(stored, path), scan)
-
-    def _scan_faces(self, stored: dict[str, np.ndarray], path: Path) -> np.ndarray | None:
-        """Faces over the scan points, where the frame has them."""
-        faces = stored.get("scan_faces")
-        if faces is None:
-            return None
-        if faces.size and (faces.min() < 0 or faces.max() >= len(stored["scan_pc"])):
-            raise DataError(path, f"scan_faces: expected indices in [0, {len(stored['scan_pc'])}), got others.")
-        return faces.astype(np.int64)
+        return Frame(name, self.name, split, self._fit(stored, path), _stored_scan(stored, path))
 
     def _fit(self, stored: dict[str, np.ndarray], path: Path) -> BodyFit:
         """The body of a frame, with what the file lacks derived from what it has, and the rest of it compared."""
@@ -152,48 +126,38 @@ class PackedOutfit(Outfit):
             posed = self.fit_pose(stored["pose"], stored.get("translation"))
             if vertices is not None and "translation" not in stored:
                 posed = self.fit_pose(stored["pose"], (vertices - posed.vertices).mean(axis=0, dtype=np.float64))
-        joint_transforms = self._joint_transforms(stored, posed, path)
-        if "vtransf" in stored:
-            transforms = _whole_transforms(stored, path)
-        elif posed is not None:
-            transforms = posed.vertex_transforms
-        else:
-            transforms = self._skin(joint_transforms)
+        whole = _whole_transforms(stored, path) if "vtransf" in stored else None
+        joint_transforms = self._joint_transforms(stored, posed, whole, path)
+        joints, given = torch.from_numpy(joint_transforms), "joint_transforms" in stored
+        if given or (whole is None and posed is None):
+            skinned = skin_transforms(template.weights, joints[None], template.canonical_from_bind)[0].numpy()
+        transforms = whole if whole is not None else skinned if posed is None else posed.vertex_transforms
         if vertices is None:
-            vertices = transform_points(torch.from_numpy(transforms), template.vertices).numpy()
-        self._compare(stored, posed, vertices, path)
+            vertices = _move(transforms, template)
+        check_size(vertices, template, path)
+        if posed is not None:
+            check_posed(posed.vertices, vertices, "pose", template, path)
+        if given:
+            check_posed(_move(skinned, template), vertices, "joint_transforms", template, path)
+        if whole is not None:
+            check_vertex_transforms(whole, template, vertices, path)
         pose_vertices = stored.get("pose_vertices")
         if pose_vertices is None and posed is not None and self.mean_body is not self.body:
             pose_vertices = posed.pose_vertices
         elif pose_vertices is None:
-            root = invert_rigid(torch.from_numpy(joint_transforms[0]))
-            pose_vertices = transform_points(root, torch.from_numpy(vertices)).numpy()
+            pose_vertices = transform_points(invert_rigid(joints[0]), torch.from_numpy(vertices)).numpy()
         return BodyFit(
             vertices=vertices,
-            vertex_transforms=_fit_translations(transforms, template.vertices.numpy(), vertices),
+            vertex_transforms=_fit_translations(transforms, template, vertices),
             joint_transforms=joint_transforms,
             pose_vertices=pose_vertices,
             translation=stored.get("translation", np.zeros(3, np.float32) if posed is None else posed.translation),
             pose=stored.get("pose"),
         )
 
-    def _compare(self, stored: dict[str, np.ndarray], posed: BodyFit | None, vertices: np.ndarray, path: Path) -> None:
-        """Refuses a frame whose body in metres, pose, joint transforms and ``vtransf`` contradict its vertices."""
-        check_size(vertices, self.template, path)
-        if posed is not None:
-            check_posed(posed.vertices, vertices, "pose", self.template, path)
-        if "joint_transforms" in stored:
-            skinned = transform_points(torch.from_numpy(self._skin(stored["joint_transforms"])), self.template.vertices)
-            check_posed(skinned.numpy(), vertices, "joint_transforms", self.template, path)
-        if "vtransf" in stored:
-            check_vertex_transforms(stored["vtransf"], self.template, vertices, path)
-
-    def _skin(self, joint_transforms: np.ndarray) -> np.ndarray:
-        """Vertex transforms ``(V, 4, 4)`` of joint transforms ``(J, 4, 4)``, both posed_from_canonical."""
-        joints, bound = torch.from_numpy(joint_transforms)[None], self.template.canonical_from_bind
-        return skin_transforms(self.template.weights, joints, bound)[0].numpy()
-
-    def _joint_transforms(self, stored: dict[str, np.ndarray], posed: BodyFit | None, path: Path) -> np.ndarray:
+    def _joint_transforms(
+        self, stored: dict[str, np.ndarray], posed: BodyFit | None, whole: np.ndarray | None, path: Path
+    ) -> np.ndarray:
         """Joint transforms ``(J, 4, 4)``: given, from the pose, or by least squares from vertex transforms.
 
         Skinning weights blend motions from the bind pose, so those are what is solved for.
@@ -207,27 +171,35 @@ class PackedOutfit(Outfit):
             return np.eye(4, dtype=np.float32)[None]
         if posed is not None:
             return posed.joint_transforms
-        if "vtransf" not in stored:
+        if whole is None:
             raise DataError(path, "expected vtransf, joint_transforms or pose to place the body, found none of them.")
-        template, transforms = self.template, _whole_transforms(stored, path)
-        whole = torch.from_numpy(_fit_translations(transforms, template.vertices.numpy(), stored.get("body_verts")))
-        bound = template.canonical_from_bind
-        from_bind = (whole @ blend_transforms(template.weights, bound[None])[0]).numpy()
+        template, bound = self.template, self.template.canonical_from_bind
+        exact = torch.from_numpy(_fit_translations(whole, template, stored.get("body_verts")))
+        from_bind = (exact @ blend_transforms(template.weights, bound[None])[0]).numpy()
         solved = fit_joint_transforms(from_bind, template.weights.numpy(), template.parents)
         return solved @ invert_rigid(bound).numpy()
 
 
+def _stored_scan(stored: dict[str, np.ndarray], path: Path) -> Scan:
+    scan = Scan(**{name: stored.get(key) for key, name in SCAN_KEYS.items()})
+    normals = scan.normals / np.maximum(np.linalg.norm(scan.normals, axis=1, keepdims=True), 1e-12)
+    faces, colors = scan.faces, scan.colors
+    if faces is not None and faces.size and (faces.min() < 0 or faces.max() >= len(scan.points)):
+        raise DataError(path, f"scan_faces: expected indices in [0, {len(scan.points)}), got others.")
+    faces = None if faces is None else faces.astype(np.int64)
+    colors = None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu")
+    return replace(scan, normals=normals, faces=faces, colors=colors)
+
+
+def _move(transforms: np.ndarray, template: Template) -> np.ndarray:
+    """The template's vertices ``(V, 3)``, each moved by its transform ``(V, 4, 4)``."""
+    return transform_points(torch.from_numpy(transforms), template.vertices).numpy()
+
+
 def fit_joint_transforms(vertex_transforms: np.ndarray, weights: np.ndarray, parents: Sequence[int]) -> np.ndarray:
-    """Rigid joint transforms whose blend by the skinning weights is nearest to given vertex transforms.
+    """Rigid joint transforms ``(J, 4, 4)`` float32 whose blend by ``weights (V, J)`` is nearest to ``(V, 4, 4)``.
 
-    Least squares over all vertices, then the nearest rotation to each joint's linear part. A joint that no vertex
-    follows moves with its parent.
-
-    Args:
-        vertex_transforms: ``(V, 4, 4)``; weights: ``(V, J)``; parents: J indices, parents before children.
-
-    Returns:
-        ``(J, 4, 4)`` float32.
+    Least squares, then the nearest rotation; a joint that no vertex follows moves with its parent.
     """
     dims = check_shape("vertex_transforms", vertex_transforms, "V 4 4")
     check_shape("weights", weights, "V J", **dims)
@@ -246,11 +218,7 @@ def fit_joint_transforms(vertex_transforms: np.ndarray, weights: np.ndarray, par
 
 
 def _whole_transforms(stored: dict[str, np.ndarray], path: Path) -> np.ndarray:
-    """``vtransf`` as ``(V, 4, 4)``.
-
-    Packed files give the rotation block alone, or a translation that leaves out the subject's place in the world;
-    `_fit_translations` puts it right where the posed vertices are known.
-    """
+    """``vtransf`` as ``(V, 4, 4)``; files may lack translations, or leave out the subject's place in the world."""
     given = stored["vtransf"]
     if given.shape[-1] == 3 and "body_verts" not in stored:
         raise DataError(path, "expected body_verts, as vtransf has no translations.")
@@ -259,20 +227,19 @@ def _whole_transforms(stored: dict[str, np.ndarray], path: Path) -> np.ndarray:
     return whole
 
 
-def _fit_translations(transforms: np.ndarray, rest: np.ndarray, posed: np.ndarray | None) -> np.ndarray:
-    """The transforms with translations that pose each rest vertex exactly, where it is known."""
+def _fit_translations(transforms: np.ndarray, template: Template, posed: np.ndarray | None) -> np.ndarray:
+    """The transforms with translations that pose each of the template's vertices exactly, where that is known."""
     if posed is None:
         return transforms
     exact = transforms.copy()
-    exact[:, :3, 3] = posed - np.einsum("vij,vj->vi", transforms[:, :3, :3], rest)
+    exact[:, :3, 3] = posed - np.einsum("vij,vj->vi", transforms[:, :3, :3], template.vertices.numpy())
     return exact
 
 
 def _stored_pose(pose: np.ndarray, joint_names: Sequence[str], path: Path) -> np.ndarray:
-    """A file's pose as axis-angle of the body's joints ``(J, 3)``.
+    """A file's pose as axis-angle of the body's joints ``(J, 3)``; of hands and face either may lack some, at rest.
 
-    Joints of hands and face may be missing from the pose, or from the body: they are at rest then. Raises `DataError`
-    for another shape, or rotations of joints that the body lacks.
+    Raises `DataError` for another shape, or rotations of joints that the body lacks.
     """
     rows, joints, shared = len(pose) if pose.shape[1:] == (3,) else 0, len(joint_names), len(SMPL_JOINTS)
     if list(joint_names[:shared]) == SMPL_JOINTS and shared <= rows != joints:
@@ -280,10 +247,8 @@ def _stored_pose(pose: np.ndarray, joint_names: Sequence[str], path: Path) -> np
             problem = f"pose: expected rotations of {joints} joints, it turns joints beyond them."
             raise DataError(path, problem, "Set body.all_joints: true in outfit.yaml to keep hands and face.")
         pose = np.concatenate([pose[:joints], np.zeros((max(joints - rows, 0), 3), pose.dtype)])
-    try:
+    with naming(path):
         check_pose(pose, joints)
-    except AvatarError as error:
-        raise DataError(path, str(error)) from error
     return pose
 
 
@@ -295,46 +260,30 @@ def _template_of_mesh(path: Path) -> Template:
         hint = f"Make one: python tools/convert_body.py <downloaded SMPL file> {target}"
         raise DataError(path.parent, problem, hint)
     mesh = read_mesh(path)
-    faces = np.asarray(mesh.faces, np.int64)
-    atlas = read_obj_atlas(path, faces, len(mesh.vertices))
+    atlas = read_obj_atlas(path, mesh.faces, len(mesh.vertices))
     return Template(
-        vertices=torch.from_numpy(np.asarray(mesh.vertices, np.float32)),
-        faces=torch.from_numpy(faces),
+        vertices=torch.from_numpy(mesh.vertices),
+        faces=torch.from_numpy(mesh.faces),
         weights=torch.ones(len(mesh.vertices), 1),
         joints=torch.zeros(1, 3),
         parents=(-1,),
         joint_names=("root",),
-        uv=None if atlas is None else torch.from_numpy(atlas.uv),
-        uv_faces=None if atlas is None else torch.from_numpy(atlas.uv_faces),
+        **({} if atlas is None else {key: torch.from_numpy(value) for key, value in vars(atlas).items()}),
     )
 
 
 def write_packed_frame(path: Path, frame: Frame) -> None:
     """Writes a frame as a packed npz that this project and the readers of the POP line understand."""
-    body, scan = frame.body, frame.scan
-    arrays = {
-        "body_verts": body.vertices,
-        "vtransf": body.vertex_transforms,
-        "joint_transforms": body.joint_transforms,
-        "pose": body.pose,
-        "translation": body.translation,
-        "pose_vertices": body.pose_vertices,
-        "scan_pc": scan.points,
-        "scan_n": scan.normals,
-        "scan_faces": scan.faces,
-        "scan_labels": scan.labels,
-        "scan_canonical": scan.canonical,
-        "scan_colors": None if scan.colors is None else color_bytes(scan.colors),
-        "scan_name": np.array(frame.name),
-    }
+    arrays = {key: getattr(frame.body, name) for key, name in BODY_KEYS.items()}
+    arrays |= {key: getattr(frame.scan, name) for key, name in SCAN_KEYS.items()}
+    if frame.scan.colors is not None:
+        arrays["scan_colors"] = color_bytes(frame.scan.colors)
+    arrays["scan_name"] = np.array(frame.name)
     write_arrays(path, {key: value for key, value in arrays.items() if value is not None})
 
 
 def write_packed_outfit(outfit: Outfit, folder: Path) -> PackedOutfit:
-    """Writes all frames of an outfit, of whatever layout, as a packed outfit with template and manifest.
-
-    Raises `DataError` for an invalid frame.
-    """
+    """Writes all frames of an outfit as a packed outfit with template and manifest; `DataError` for an invalid one."""
     folder = Path(folder)
     settings = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{outfit.dataset}/{outfit.name}"}
     if outfit.body is None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from avatar.checks import AvatarError
-from avatar.data.outfits import SPLITS, Outfit
+from avatar.data.folders import SPLITS
+from avatar.data.outfits import Outfit
 
 SEVERAL_SEQUENCES = 4  # from here on whole sequences are held back, below it frames
 
@@ -22,10 +23,8 @@ class SplitConfig:
 
     def __post_init__(self):
         if not 0 <= self.validation_share < 1 or not 0 < self.train_fraction <= 1:
-            raise AvatarError(
-                "validation_share: expected at least 0 and below 1; train_fraction: above 0 and at most 1; "
-                f"got {self.validation_share} and {self.train_fraction}."
-            )
+            expected = "validation_share: expected at least 0 and below 1; train_fraction: above 0 and at most 1"
+            raise AvatarError(f"{expected}; got {self.validation_share} and {self.train_fraction}.")
 
 
 @dataclass(frozen=True)
@@ -45,22 +44,17 @@ def split_outfit(outfit: Outfit, config: SplitConfig | None = None) -> Split:
 
 
 def split_frames(names: Sequence[str], config: SplitConfig) -> Split:
-    """Holds back validation frames, then thins the rest; depends on the names alone.
+    """Holds back validation frames, then thins the rest evenly; depends on the names alone.
 
-    Whole sequences (the name up to its last dot) are held back where there are four or more, because neighbouring
-    frames are nearly copies; otherwise the last stretch of frames is. The fraction keeps evenly spaced frames, and does
-    not change which frames validate. Raises `AvatarError` when there are too few frames to share.
+    Whole sequences are held back where there are four or more, because neighbouring frames are nearly copies, otherwise
+    the last frames. Raises `AvatarError` when there are too few frames to share.
     """
     names = sorted(names)
-    count = round(len(names) * config.validation_share)
-    count = max(count, 1) if config.validation_share > 0 else 0
+    count = max(round(len(names) * config.validation_share), 1) if config.validation_share > 0 else 0
     if count >= len(names):
-        raise AvatarError(
-            f"validation_share: expected frames left to train on, {len(names)} frames give none. Set it to 0."
-        )
-    held = set(_held_sequences(names, count) if count else ())
-    if count and not held:
-        held = set(names[len(names) - count :])
+        problem = f"expected frames left to train on, {len(names)} frames give none. Set it to 0."
+        raise AvatarError(f"validation_share: {problem}")
+    held = set((_held_sequences(names, count) or names[-count:]) if count else ())
     train = [name for name in names if name not in held]
     kept = np.floor(np.arange(np.ceil(len(train) * config.train_fraction - 1e-9)) / config.train_fraction + 1e-9)
     return Split(tuple(train[int(i)] for i in kept), tuple(name for name in names if name in held))
@@ -88,9 +82,6 @@ def _held_sequences(names: Sequence[str], count: int) -> list[str]:
 
 def check_leakage(train: Sequence[str], test: Sequence[str], outfit: str) -> None:
     """Refuses a frame that is both trained and tested on. Raises `AvatarError` naming the first such frames."""
-    shared = sorted(set(train) & set(test))
-    if shared:
-        raise AvatarError(
-            f"{outfit}: expected different frames in train and test, {len(shared)} are in both "
-            f"({', '.join(shared[:3])}). Remove them from one."
-        )
+    if shared := sorted(set(train) & set(test)):
+        problem = f"expected different frames in train and test, {len(shared)} are in both ({', '.join(shared[:3])})"
+        raise AvatarError(f"{outfit}: {problem}. Remove them from one.")

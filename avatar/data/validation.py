@@ -1,16 +1,17 @@
-"""Checks of bodies, poses and frames when they are loaded: units, axes, overlap of scan and body, normals."""
+"""Checks of what is loaded: units, axes, overlap of scan and body, normals, and that a frame's parts say the same."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from avatar.body.packed import border_positions
 from avatar.checks import AvatarError, DataError, check_finite
-from avatar.geometry.trees import Tree, build_tree
+from avatar.geometry.trees import build_tree
 from avatar.records import Frame, Scan, Template
 
 SKIN_SAMPLES = 500  # places on the body, spread by area
@@ -19,104 +20,9 @@ DEEP_SAMPLES = 500  # scan points whose side of the skin is looked at
 NEAR = 0.10  # metres from skin to scan; a wide dress is farther from the legs, and near everywhere else
 DEEP = 0.03  # metres under the skin, beyond what a good fit leaves
 CURED, CURED_BURIED = 0.9, 0.05  # share of the body that a suggestion must bring near the scan, and of scan buried
-MIRRORED = {"x": (-1, 1, 1), "y": (1, -1, 1), "z": (1, 1, -1)}
-
-
-@dataclass(frozen=True)
-class Overlap:
-    """How a scan lies over a body.
-
-    ``covered`` share of the body's skin with a scan point near, ``buried`` share of scan points deep under the skin,
-    ``outward`` share of scan normals that point the way the skin below them does.
-    """
-
-    covered: float
-    buried: float
-    outward: float
-
-
-def measure_overlap(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Overlap:
-    """How scan points ``(M, 3)`` lie over a body ``(V, 3)`` with faces ``(F, 3)``; looks at some of each, in 10 ms."""
-    centres, outward, areas = _face_frames(vertices, faces)
-    skin = centres[_spread(areas, SKIN_SAMPLES)]
-    some = _thin(len(points), DEEP_SAMPLES)
-    _, below = build_tree(centres).query(points[some])
-    heights = ((points[some] - centres[below]) * outward[below]).sum(axis=1)
-    return Overlap(
-        covered=_covered(skin, *_scan_tree(points)),
-        buried=float((heights < -DEEP).mean()),
-        outward=float(((normals[some] * outward[below]).sum(axis=1) > 0).mean()),
-    )
-
-
-def suggest_hint(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> str:
-    """What would lay a scan over its body: a move, a turn by right angles, a mirror; or that none of them does."""
-    centres, _, areas = _face_frames(vertices, faces)
-    skin = centres[_spread(areas, SKIN_SAMPLES)]
-    tree, reach = _scan_tree(points)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    best, words, corrected = 0.0, "", points
-    for name, linear in _mistakes():
-        moved = skin @ linear  # the inverse of an orthogonal matrix is its transpose: the body goes to the scan
-        if name and (share := _covered(moved, tree, reach)) > best:
-            best, words, corrected = share, name, points @ linear.T
-        shift = middle - (moved.min(axis=0) + moved.max(axis=0)) / 2
-        share = _covered(moved + shift, tree, reach)
-        if share > best + 0.02:  # a suggestion without a move is the simpler one
-            back = -linear @ shift
-            numbers = ", ".join(f"{step:.2f}" for step in back)
-            words = f"{name} and moving it by ({numbers}) m" if name else f"Moving it by ({numbers}) m"
-            best, corrected = share, points @ linear.T + back
-    if best < CURED or measure_overlap(corrected, normals, vertices, faces).buried > CURED_BURIED:
-        return "Neither a move, a turn by right angles nor a mirror corrects it: is the fit of another frame or person?"
-    return f"{words} would lay it over the body; or do the reverse to the fit."
-
-
-def _mistakes() -> Iterator[tuple[str, np.ndarray]]:
-    """What may have to be done to a scan, in words and as an orthogonal matrix; the first is nothing."""
-    yield "", np.eye(3)
-    for axis in "xyz":
-        for angle in (-90, 90, 180):
-            turn = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
-            yield f"Turning the scan by {angle} degrees about {axis}", turn
-    for axis, signs in MIRRORED.items():
-        yield f"Mirroring the scan ({axis} to -{axis})", np.diag(signs).astype(float)
-    yield "Swapping y and z of the scan", np.eye(3)[[0, 2, 1]]
-
-
-def _face_frames(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres ``(F, 3)``, unit normals ``(F, 3)`` and areas ``(F,)`` of faces, in float64."""
-    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
-    crosses = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(crosses, axis=1)
-    return (a + b + c) / 3, crosses / np.maximum(lengths, 1e-20)[:, None], lengths / 2
-
-
-def _spread(areas: np.ndarray, count: int) -> np.ndarray:
-    """Faces at even steps of the area, ``(count,)``: hands are a small part of it, and a large one of the faces."""
-    cumulative = areas.cumsum()
-    return np.searchsorted(cumulative, (np.arange(count) + 0.5) / count * cumulative[-1]).clip(max=len(areas) - 1)
-
-
-def _thin(count: int, most: int) -> np.ndarray:
-    """At most so many indices below a count, evenly."""
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
-
-
-def _scan_tree(points: np.ndarray) -> tuple[Tree, float]:
-    """Some of a scan's points to search, and how far from skin one of them must be found, metres."""
-    some = points[_thin(len(points), SCAN_SAMPLES)]
-    spacing = np.sqrt(2 / len(some))  # of points on two square metres of person
-    return build_tree(some), max(NEAR, 2 * spacing)
-
-
-def _covered(skin: np.ndarray, tree: Tree, reach: float) -> float:
-    """Share of places on the skin with a scan point within reach."""
-    return float(np.isfinite(tree.query(skin, distance_upper_bound=reach)[0]).mean())
-
-
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
+UNITS = {"centimetres": 100, "millimetres": 1000}  # in a metre
 FEWEST_POINTS = 100
 FAR_OFF = 10.0  # metres between the middles of scan and body that only a translation in other units explains
 # A valid frame covers 94% and more of the body, long dresses and raw scans included, and buries nothing.
@@ -125,10 +31,10 @@ DOUBTFUL_COVERED, DOUBTFUL_BURIED, DOUBTFUL_OUTWARD = 0.85, 0.01, 0.8  # the fir
 INSIDE_OUT, UNORIENTED = 0.25, 0.7  # shares of normals that point outward
 ALONG = 0.7  # cosine to an axis from which on a direction runs along it
 MOST_TURN = 2 * np.pi + 0.1  # radians; no joint turns farther, and degrees soon exceed it
-AXES = (  # two joints, where the second lies from the first
-    ("pelvis", "neck", "+y"),
-    ("right_hip", "left_hip", "+x"),
-)
+JOINT_GAP, JOINTS_GAP = 0.25, 0.12  # metres from a joint to its weights' border: one, median (open body: 0.13, 0.04)
+APART, SHARE = 0.05, 0.99  # metres between posed bodies at that share of vertices: margin for lost blendshapes
+EDGE_ERROR = 0.18  # of the edges' length: 0.03 to 0.10 where right (sample outfits), 0.27 and more for no rotation
+AXES = (("pelvis", "neck", "+y"), ("right_hip", "left_hip", "+x"))  # two joints, where the second lies from the first
 TURNS = {  # where it should lie and where it does: what corrects it
     ("+y", "-y"): "Turn body and scans by 180 degrees about z: (x, y, z) to (-x, -y, z).",
     ("+y", "+z"): "Turn body and scans by -90 degrees about x: (x, y, z) to (x, z, -y).",
@@ -144,83 +50,15 @@ TURNS = {  # where it should lie and where it does: what corrects it
 def check_template(template: Template, path: Path) -> None:
     """Refuses a body at rest that does not stand upright in metres, y up, facing +z.
 
-    Raises `DataError` with the turn, or the factor, that would correct it.
+    Raises `DataError` with the turn or the factor that would correct it.
     """
-    vertices = template.vertices.numpy()
-    extents = np.ptp(vertices, axis=0)
+    extents = np.ptp(template.vertices.numpy(), axis=0)
     low, high = BODY_HEIGHT
     if low <= extents.max() <= high:
         _check_axes(template, path)
     if not low <= extents[1] <= high:
         problem = f"vertices: expected a body {low} to {high} m high, got {extents[1]:.4g} along y."
         raise DataError(path, problem, _unit_hint(float(extents[1])))
-
-
-def check_frame(frame: Frame, template: Template, path: Path) -> None:
-    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out.
-
-    Raises `DataError` naming the file, what was expected and how to correct it.
-    """
-    points, body = frame.scan.points, frame.body.vertices
-    if len(points) < FEWEST_POINTS:
-        problem = f"scan: expected at least {FEWEST_POINTS} points, got {len(points)}."
-        raise DataError(path, problem, "Leave the frame out or scan it again.")
-    check_size(body, template, path)
-    posed, scan = _diagonal(body), _diagonal(points)
-    low, high = SIZE_RATIO
-    if not low <= scan / posed <= high:
-        problem = f"scan: expected about {posed:.2f} m across as the body, got {scan:.4g}."
-        raise DataError(path, problem, _unit_hint(scan))
-    lengths = np.linalg.norm(frame.scan.normals, axis=1)
-    if (np.abs(lengths - 1) > 0.05).mean() > 0.01:
-        problem = f"scan normals: expected unit length, got {lengths.min():.3g} to {lengths.max():.3g}."
-        raise DataError(path, problem, "Normalise them, or compute them anew.")
-    faces = template.faces.numpy()
-    overlap = measure_overlap(points, frame.scan.normals, body, faces)
-    _check_overlap(overlap, frame.scan, body, faces, path)
-    _check_normals(overlap, frame.scan, path)
-
-
-def check_size(body: np.ndarray, template: Template, path: Path) -> None:
-    """Refuses a posed body ``(V, 3)`` in other units than its template. Raises `DataError` with the factor."""
-    rest, posed = _diagonal(template.vertices.numpy()), _diagonal(body)
-    low, high = SIZE_RATIO
-    if not low <= posed / rest <= high:
-        problem = f"body: expected about {rest:.2f} m across as at rest, got {posed:.4g}."
-        raise DataError(path, problem, _unit_hint(posed))
-
-
-def check_pose(pose: np.ndarray, joints: int) -> None:
-    """Refuses a pose that is not ``(J, 3)`` axis-angle in radians: matrices, quaternions, flat vectors, degrees.
-
-    Args:
-        pose: what came.
-        joints: J, of the body.
-
-    Raises `AvatarError` with what it looks like and how to write it as expected.
-    """
-    shape = tuple(np.shape(pose))
-    if shape != (joints, 3):
-        problem = f"pose: expected shape ({joints}, 3), axis-angle in radians, got {shape}."
-        raise AvatarError(f"{problem} {_pose_hint(shape, joints)}".strip())
-    check_finite("pose", pose)
-    turns = np.linalg.norm(np.asarray(pose, np.float64), axis=1)
-    if turns.max() > MOST_TURN:
-        raise AvatarError(
-            f"pose: expected radians, joint {int(turns.argmax())} turns by {turns.max():.4g}, more than a full turn. "
-            "That looks like degrees: multiply by pi / 180."
-        )
-
-
-def check_frame_count(names: Sequence[str], path: Path, what: str, least: int = 2) -> None:
-    """Refuses fewer frames than something can be learned from.
-
-    Raises `DataError` naming what needs more, and the frames there are.
-    """
-    if len(set(names)) < least:
-        there = f"{len(set(names))} ({', '.join(sorted(set(names)))})" if names else "none"
-        problem = f"{what} needs at least {least} frames in different poses, there is {there}."
-        raise DataError(path, problem, "What moves with which joint shows only between poses: add scans.")
 
 
 def _check_axes(template: Template, path: Path) -> None:
@@ -244,6 +82,136 @@ def _axis_along(direction: np.ndarray) -> str:
     return f"{'+' if unit[axis] > 0 else '-'}{'xyz'[axis]}" if abs(unit[axis]) > ALONG else ""
 
 
+def check_joints(template: Template, path: Path) -> None:
+    """Refuses joints that do not lie near the borders at which the skinning weights of their subtrees fade.
+
+    Joints without a border (`joint_positions`) are not judged. Raises `DataError` with the largest gap and its cause.
+    """
+    vertices = template.vertices.numpy()
+    borders = border_positions(vertices, template.weights.numpy(), template.parents)
+    judged = np.isfinite(borders[:, 0]) & (np.arange(len(borders)) > 0)
+    if not judged.any():
+        return
+    joints, borders = template.joints.numpy().astype(np.float64)[judged], borders[judged]
+    scale = max(float(np.ptp(vertices[:, 1])), 1e-6) / 1.7  # limits are those of a person of 1.7 m
+
+    def fit(places: np.ndarray) -> bool:
+        gaps = np.linalg.norm(places - borders, axis=1) / scale
+        return gaps.max() <= JOINT_GAP and np.median(gaps) <= JOINTS_GAP
+
+    if fit(joints):
+        return
+    names = [name for name, known in zip(template.joint_names, judged) if known]
+    gaps = np.linalg.norm(joints - borders, axis=1)
+    problem = (
+        f"joints: expected each where the weights of its subtree end, {names[gaps.argmax()]} lies {gaps.max():.2f} m "
+        f"from there and half of them lie {np.median(gaps):.2f} m or more."
+    )
+    raise DataError(path, problem, _joint_hint(joints, borders, names, fit))
+
+
+def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: Callable[[np.ndarray], bool]) -> str:
+    """What would lay joints ``(J, 3)`` on the borders of their weights ``(J, 3)``, so that they ``fit``."""
+    for unit, factor in UNITS.items():
+        if fit(joints / factor):
+            return f"They look like {unit}: divide joints by {factor}."
+    other = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in names]
+    if set(other) == set(names) and fit(joints[[names.index(name) for name in other]]):
+        return "The weights of left and right look swapped: exchange their columns, or the joints' names."
+    shift = np.median(borders - joints, axis=0)
+    if fit(joints + shift):
+        return f"Moving all joints by {_vector(shift)} m would lay them there."
+    return "Are joints in the order of the weights' columns, at rest, in metres, in the vertices' coordinates?"
+
+
+def check_frame(frame: Frame, template: Template, path: Path) -> None:
+    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out."""
+    scan, body, faces = frame.scan, frame.body.vertices, template.faces.numpy()
+    if len(scan.points) < FEWEST_POINTS:
+        problem = f"scan: expected at least {FEWEST_POINTS} points, got {len(scan.points)}."
+        raise DataError(path, problem, "Leave the frame out or scan it again.")
+    check_size(body, template, path)
+    _check_ratio("scan", scan.points, body, "the body", path)
+    lengths = np.linalg.norm(scan.normals, axis=1)
+    if (np.abs(lengths - 1) > 0.05).mean() > 0.01:
+        problem = f"scan normals: expected unit length, got {lengths.min():.3g} to {lengths.max():.3g}."
+        raise DataError(path, problem, "Normalise them, or compute them anew.")
+    overlap = measure_overlap(scan.points, scan.normals, body, faces)
+    _check_overlap(overlap, scan, body, faces, path)
+    _check_normals(overlap, scan, path)
+
+
+def check_size(body: np.ndarray, template: Template, path: Path) -> None:
+    """Refuses a posed body ``(V, 3)`` in other units than its template. Raises `DataError` with the factor."""
+    _check_ratio("body", body, template.vertices.numpy(), "at rest", path)
+
+
+def _check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, path: Path) -> None:
+    """Refuses points of another size than those they should be like, by the diagonals of their bounding boxes."""
+    size, expected = (float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (points, like))
+    low, high = SIZE_RATIO
+    if not low <= size / expected <= high:
+        problem = f"{what}: expected about {expected:.2f} m across as {words}, got {size:.4g}."
+        raise DataError(path, problem, _unit_hint(size))
+
+
+def _unit_hint(size: float) -> str:
+    for unit, factor in UNITS.items():
+        if BODY_HEIGHT[0] <= size / factor <= 2 * BODY_HEIGHT[1]:
+            return f"That looks like {unit}: divide positions and translations by {factor} (multiply by {1 / factor})."
+    if BODY_HEIGHT[0] <= size * 1000 <= 2 * BODY_HEIGHT[1]:
+        return "That looks like kilometres, or metres scaled twice: multiply positions and translations by 1000."
+    return "Positions must be in metres with y up."
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Shares: of skin with a scan point near, of scan deep under the skin, of scan normals that point as it does."""
+
+    covered: float
+    buried: float
+    outward: float
+
+
+def measure_overlap(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Overlap:
+    """How scan points ``(M, 3)`` lie over a body ``(V, 3)`` with faces ``(F, 3)``; looks at some of each, in 10 ms."""
+    centres, outward, skin = _face_frames(vertices, faces)
+    some = _thin(len(points), DEEP_SAMPLES)
+    _, below = build_tree(centres).query(points[some])
+    heights = ((points[some] - centres[below]) * outward[below]).sum(axis=1)
+    return Overlap(
+        covered=_coverage(points)(skin),
+        buried=float((heights < -DEEP).mean()),
+        outward=float(((normals[some] * outward[below]).sum(axis=1) > 0).mean()),
+    )
+
+
+def _face_frames(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres and unit normals of faces ``(F, 3)``, and centres ``(S, 3)`` at even steps of the area, in float64.
+
+    Hands are a small part of the area, and a large one of the faces.
+    """
+    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
+    crosses = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(crosses, axis=1)
+    centres, areas = (a + b + c) / 3, (lengths / 2).cumsum()
+    places = np.searchsorted(areas, (np.arange(SKIN_SAMPLES) + 0.5) / SKIN_SAMPLES * areas[-1])
+    return centres, crosses / np.maximum(lengths, 1e-20)[:, None], centres[places.clip(max=len(areas) - 1)]
+
+
+def _thin(count: int, most: int) -> np.ndarray:
+    """At most so many indices below a count, evenly."""
+    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+
+
+def _coverage(points: np.ndarray) -> Callable[[np.ndarray], float]:
+    """What measures the share of places on the skin with one of a scan's points within reach."""
+    some = points[_thin(len(points), SCAN_SAMPLES)]
+    tree, spacing = build_tree(some), np.sqrt(2 / len(some))  # of points on two square metres of person
+    reach = max(NEAR, 2 * spacing)
+    return lambda skin: float(np.isfinite(tree.query(skin, distance_upper_bound=reach)[0]).mean())
+
+
 def _check_overlap(overlap: Overlap, scan: Scan, body: np.ndarray, faces: np.ndarray, path: Path) -> None:
     """Refuses a scan that does not lie over its body, with the move or turn that would lay it there."""
     inside_out = overlap.outward < INSIDE_OUT
@@ -258,10 +226,46 @@ def _check_overlap(overlap: Overlap, scan: Scan, body: np.ndarray, faces: np.nda
     )
     shift = np.median(body, axis=0) - np.median(scan.points, axis=0)
     if np.abs(shift).max() > FAR_OFF:
-        hint = f"Their middles differ by ({', '.join(f'{s:.1f}' for s in shift)}) m: is the translation in metres?"
+        hint = f"Their middles differ by {_vector(shift, 1)} m: is the translation in metres?"
     else:
         hint = suggest_hint(scan.points, scan.normals, body, faces)
     raise DataError(path, problem, hint)
+
+
+def suggest_hint(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> str:
+    """What would lay a scan over its body: a move, a turn by right angles, a mirror; or that none of them does."""
+    covered, (_, _, skin) = _coverage(points), _face_frames(vertices, faces)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    best, words, corrected = 0.0, "", points
+    for name, linear in _mistakes():
+        moved = skin @ linear  # the inverse of an orthogonal matrix is its transpose: the body goes to the scan
+        if name and (share := covered(moved)) > best:
+            best, words, corrected = share, name, points @ linear.T
+        shift = middle - (moved.min(axis=0) + moved.max(axis=0)) / 2
+        share = covered(moved + shift)
+        if share > best + 0.02:  # a suggestion without a move is the simpler one
+            back = -linear @ shift
+            words = f"{name} and moving it by {_vector(back)} m" if name else f"Moving it by {_vector(back)} m"
+            best, corrected = share, points @ linear.T + back
+    if best < CURED or measure_overlap(corrected, normals, vertices, faces).buried > CURED_BURIED:
+        return "Neither a move, a turn by right angles nor a mirror corrects it: is the fit of another frame or person?"
+    return f"{words} would lay it over the body; or do the reverse to the fit."
+
+
+def _mistakes() -> Iterator[tuple[str, np.ndarray]]:
+    """What may have to be done to a scan, in words and as an orthogonal matrix; the first is nothing."""
+    yield "", np.eye(3)
+    for axis in "xyz":
+        for angle in (-90, 90, 180):
+            turn = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
+            yield f"Turning the scan by {angle} degrees about {axis}", turn
+    for axis, row in zip("xyz", np.eye(3)):
+        yield f"Mirroring the scan ({axis} to -{axis})", np.diag(1 - 2 * row)
+    yield "Swapping y and z of the scan", np.eye(3)[[0, 2, 1]]
+
+
+def _vector(steps: np.ndarray, digits: int = 2) -> str:
+    return f"({', '.join(f'{step:.{digits}f}' for step in steps)})"
 
 
 def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> None:
@@ -282,35 +286,107 @@ def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> None:
         raise DataError(path, problem, "Swap two columns of the faces.")
 
 
+def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Template, path: Path) -> None:
+    """Refuses ``vertices (V, 3)`` that ``posed (V, 3)``, the template posed by the frame's ``what``, does not meet.
+
+    Raises `DataError` with the distance, metres, and the likely cause.
+    """
+
+    def distance(moved: np.ndarray) -> float:  # that all but a hundredth of the vertices keep
+        return float(np.quantile(np.linalg.norm(moved - vertices, axis=1), SHARE))
+
+    if (apart := distance(posed)) <= APART:
+        return
+    middle, other = vertices.mean(axis=0), posed.mean(axis=0)
+    turn, _ = Rotation.align_vectors(vertices - middle, posed - other)
+    turned = turn.apply(posed - other) + middle
+    if distance(posed + middle - other) <= APART:
+        hint = f"A move of {_vector(middle - other)} m would: is the translation right?"
+    elif distance(turned) <= APART:
+        degrees = np.degrees(turn.magnitude())
+        hint = f"Turning the whole body by {degrees:.0f} degrees would: is the root's rotation in both?"
+    else:
+        off = np.linalg.norm(turned - vertices, axis=1) > APART
+        joint = template.joint_names[int(template.weights.numpy()[off].sum(axis=0).argmax())]
+        hint = (
+            f"Vertices of {joint} are off most. Is {what} this frame's, with joints in the template's order, not "
+            "negated and not zeros, and are the template's shape (betas), weights and joints this person's?"
+        )
+    problem = f"{what}: expected it to put the template on the frame's body, it leaves {1 - SHARE:.0%} of the vertices"
+    raise DataError(path, f"{problem} {apart:.3f} m or more away.", hint)
+
+
+def check_vertex_transforms(transforms: np.ndarray, template: Template, vertices: np.ndarray, path: Path) -> None:
+    """Refuses ``vtransf (V, 4, 4)`` that does not turn the template's edges onto those of ``vertices (V, 3)``.
+
+    Raises `DataError` with the mean error in lengths of the edges and the likely cause.
+    """
+    linear = transforms[:, :3, :3].astype(np.float64)
+    starts, ends = template.faces[:, :2].flatten().numpy(), template.faces[:, 1:].flatten().numpy()
+    rest = template.vertices.numpy()[ends].astype(np.float64) - template.vertices.numpy()[starts]
+    posed = vertices[ends].astype(np.float64) - vertices[starts]
+    lengths = np.linalg.norm(rest, axis=1).sum()
+
+    def pose_edges(linear: np.ndarray) -> np.ndarray:
+        return np.einsum("eij,ej->ei", (linear[starts] + linear[ends]) / 2, rest)
+
+    def error(edges: np.ndarray) -> float:
+        return float(np.linalg.norm(edges - posed, axis=1).sum() / lengths)
+
+    skinned = pose_edges(linear)
+    found, transposed = error(skinned), error(pose_edges(np.swapaxes(linear, 1, 2)))
+    backwards = transposed < found / 2
+    if found <= (EDGE_ERROR / 2 if backwards else EDGE_ERROR):
+        return
+    turn, _ = Rotation.align_vectors(posed, skinned)
+    if backwards:
+        hint = "Transposed it does: store posed_from_rest, not its inverse, in matrices that multiply columns."
+    elif error(turn.apply(skinned)) <= EDGE_ERROR:
+        degrees = np.degrees(turn.magnitude())
+        hint = f"Turned by {degrees:.0f} degrees as a whole it does: is the root's rotation in both?"
+    elif np.abs(linear - np.eye(3)).max() < 1e-3:
+        hint = "It is the identity: bring this frame's transforms, or leave the key out where pose is there."
+    else:
+        hint = "Is it this frame's, from rest to pose, in the template's order of vertices?"
+    problem = f"vtransf: expected it to turn the template's edges onto those of the body, it errs by {found:.0%}"
+    raise DataError(path, f"{problem} of their length.", hint)
+
+
+def check_pose(pose: np.ndarray, joints: int) -> None:
+    """Refuses a pose that is not ``(J, 3)`` axis-angle in radians; `AvatarError` says what it looks like instead."""
+    shape = tuple(np.shape(pose))
+    if shape != (joints, 3):
+        problem = f"pose: expected shape ({joints}, 3), axis-angle in radians, got {shape}."
+        raise AvatarError(f"{problem} {_pose_hint(shape, joints)}".strip())
+    check_finite("pose", pose)
+    turns = np.linalg.norm(np.asarray(pose, np.float64), axis=1)
+    if turns.max() > MOST_TURN:
+        raise AvatarError(
+            f"pose: expected radians, joint {int(turns.argmax())} turns by {turns.max():.4g}, more than a full turn. "
+            "That looks like degrees: multiply by pi / 180."
+        )
+
+
 def _pose_hint(shape: tuple[int, ...], joints: int) -> str:
-    """What a pose of another shape looks like, and how to write it as axis-angle."""
-    if shape[-2:] == (3, 3) and len(shape) == 3:
-        return "These are rotation matrices: scipy.spatial.transform.Rotation.from_matrix(pose).as_rotvec()."
-    if len(shape) == 2 and shape[1] == 4:
-        return "These are quaternions: scipy.spatial.transform.Rotation.from_quat(pose).as_rotvec(), x y z w."
-    if shape == (joints, 6):
-        return "These are 6D rotations: make matrices of them, then rotation vectors."
-    if shape in ((joints * 3,), (1, joints * 3)):
-        return f"It is flat: pose.reshape({joints}, 3)."
-    total = int(np.prod(shape)) if shape else 0
-    flat = len(shape) == 1 or shape[0] == 1
-    if total % 3 == 0 and total > joints * 3 and (flat or (len(shape) == 2 and shape[1] == 3)):
-        count = total // 3
-        first = f"pose.reshape({count}, 3)[:{joints}]" if flat else f"pose[:{joints}]"
-        return f"It has {count} joints; where the first {joints} are this body's, as for SMPL and SMPL-X: {first}."
-    return "One rotation vector a joint, relative to its parent."
+    total, flat = int(np.prod(shape)) if shape else 0, len(shape) == 1 or shape[:1] == (1,)
+    count = total // 3
+    first = f"pose.reshape({count}, 3)[:{joints}]" if flat else f"pose[:{joints}]"
+    longer = total % 3 == 0 and count > joints and (flat or (len(shape) == 2 and shape[1] == 3))
+    rotation = "scipy.spatial.transform.Rotation"
+    hints = {
+        f"These are rotation matrices: {rotation}.from_matrix(pose).as_rotvec().": shape[1:] == (3, 3),
+        f"These are quaternions: {rotation}.from_quat(pose).as_rotvec(), x y z w.": shape[1:] == (4,),
+        "These are 6D rotations: make matrices of them, then rotation vectors.": shape == (joints, 6),
+        f"It is flat: pose.reshape({joints}, 3).": flat and total == joints * 3,
+        f"It has {count} joints; where the first {joints} are this body's, as for SMPL and SMPL-X: {first}.": longer,
+        "One rotation vector a joint, relative to its parent.": True,
+    }
+    return next(hint for hint, fits in hints.items() if fits)
 
 
-def _diagonal(points: np.ndarray) -> float:
-    """Length of a cloud's bounding-box diagonal."""
-    return float(np.linalg.norm(np.ptp(points, axis=0)))
-
-
-def _unit_hint(size: float) -> str:
-    """What to do about a person of a wrong size."""
-    for factor, unit in ((100, "centimetres"), (1000, "millimetres")):
-        if BODY_HEIGHT[0] <= size / factor <= 2 * BODY_HEIGHT[1]:
-            return f"That looks like {unit}: divide positions and translations by {factor} (multiply by {1 / factor})."
-    if BODY_HEIGHT[0] <= size * 1000 <= 2 * BODY_HEIGHT[1]:
-        return "That looks like kilometres, or metres scaled twice: multiply positions and translations by 1000."
-    return "Positions must be in metres with y up."
+def check_frame_count(names: Sequence[str], path: Path, what: str, least: int = 2) -> None:
+    """Refuses fewer frames than can be learned from; `DataError` names what needs more and those there are."""
+    if len(set(names)) < least:
+        there = f"{len(set(names))} ({', '.join(sorted(set(names)))})" if names else "none"
+        problem = f"{what} needs at least {least} frames in different poses, there is {there}."
+        raise DataError(path, problem, "What moves with which joint shows only between poses: add scans.")

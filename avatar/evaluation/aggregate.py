@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from avatar.checks import AvatarError
-from avatar.evaluation.metrics import find_metrics
-from avatar.evaluation.scores import FrameScore, Score
+from avatar.checks import AvatarError, unknown_name
+from avatar.evaluation.metrics import METRICS
+from avatar.evaluation.scores import FrameScore, Score, Scores, csv_text
 
 FLOORS = ("sampling", "body", "static")
+ALL = "all outfits"
+COLUMNS = ("metric", "outfit", "method", "baseline", "difference", "low", "high", "confidence", "frames", "unit")
 
 
 class Place(NamedTuple):
@@ -24,8 +26,7 @@ class Place(NamedTuple):
     fraction: str = ""
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """A method's mean on one outfit, over its ``frames`` and over its training seeds."""
 
     value: float
@@ -33,8 +34,7 @@ class Cell:
     points: int
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """A difference of two methods, ``first - second``, and where it lies with the given confidence."""
 
     difference: float
@@ -43,9 +43,15 @@ class Interval:
     confidence: float
     frames: int
 
-    def written(self, scale: float) -> str:
-        """The difference and its interval as printed, in units ``1 / scale`` of the metric's."""
-        return f"{self.difference * scale:+.3f} [{self.low * scale:+.3f}, {self.high * scale:+.3f}]"
+
+class Difference(NamedTuple):
+    """A method less its baseline in one metric, over one outfit's frames or over those of all, in the metric's unit."""
+
+    metric: str
+    outfit: str
+    method: str
+    baseline: str
+    interval: Interval
 
 
 def named(method: str, *parts: str) -> str:
@@ -94,12 +100,16 @@ def grouped(rows: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list]:
     return groups
 
 
-def average_seeds(rows: Iterable[Score], by_fraction: bool = False) -> dict[Place, Cell]:
-    """Means over training seeds, in the metrics' units; ``by_fraction`` keeps the share of frames out of the names.
+def rows_of(rows: Iterable[Score], metrics: Collection[str]) -> list[Score]:
+    """The rows of some metrics; `AvatarError` where there are none."""
+    found = [row for row in rows if row.metric in metrics]
+    if not found:
+        raise AvatarError(f"rows: no score of {', '.join(metrics)} among them.")
+    return found
 
-    Raises:
-        AvatarError: for two rows of one seed for the same number.
-    """
+
+def average_seeds(rows: Iterable[Score], by_fraction: bool = False) -> dict[Place, Cell]:
+    """Means over training seeds, in the metrics' units; ``by_fraction`` keeps the share of frames out of the names."""
 
     def place_of(row: Score) -> Place:
         share = f"{100 * row.fraction:g}%" if by_fraction else ""
@@ -119,22 +129,6 @@ def average_seeds(rows: Iterable[Score], by_fraction: bool = False) -> dict[Plac
     return cells
 
 
-def tabulate(rows: Iterable[Score], metric: str) -> dict[str, dict[str, Cell]]:
-    """Outfit to method to `Cell` for one metric; several training seeds of a method are averaged.
-
-    Raises:
-        AvatarError: for an unknown metric, one that nobody scored, or two rows for the same number.
-    """
-    find_metrics([metric])
-    cells = average_seeds(row for row in rows if row.metric == metric)
-    if not cells:
-        raise AvatarError(f"rows: no score of {metric} among them.")
-    grid: dict[str, dict[str, Cell]] = {outfit: {} for outfit in sorted({place.outfit for place in cells})}
-    for place, cell in cells.items():
-        grid[place.outfit][place.method] = cell
-    return grid
-
-
 def frame_weighted_mean(cells: Sequence[Cell | Score]) -> float:
     """The mean over all frames of all outfits: each outfit's mean counts as often as it has frames."""
     return float(np.average([cell.value for cell in cells], weights=[cell.frames for cell in cells]))
@@ -146,13 +140,7 @@ def worst_outfit(cells: Iterable[Cell], higher_is_better: bool = False) -> float
 
 
 def paired_differences(frames: Iterable[FrameScore], metric: str, first: str, second: str) -> dict[str, list[float]]:
-    """``first - second`` on every frame that both methods have, by outfit; seeds are averaged.
-
-    Args:
-        frames: single-frame scores.
-        metric: its name.
-        first, second: methods as `method_key` names them.
-    """
+    """``first - second``, methods as `method_key` names them, on every frame of both, by outfit; seeds are averaged."""
     mine = (row for row in frames if row.metric == metric and method_key(row) in (first, second))
     differences: dict[str, list[float]] = {}
     for (outfit, _), rows in grouped(mine, lambda row: (row.outfit, row.frame)).items():
@@ -166,10 +154,8 @@ def paired_differences(frames: Iterable[FrameScore], metric: str, first: str, se
 def bootstrap_mean(
     groups: Iterable[Sequence[float]], resamples: int = 2000, confidence: float = 0.95, seed: int = 0
 ) -> Interval:
-    """The mean of all values with its percentile bootstrap interval; values are redrawn within their group.
-
-    They count as independent: true of settled poses; neighbours in a motion are alike, and the interval is then too
-    narrow.
+    """The mean of all values with its percentile bootstrap interval; values are redrawn within their group. They count
+    as independent: true of settled poses; for neighbours in a motion the interval is too narrow.
     """
     groups = [np.asarray(values, np.float64) for values in groups]
     count = sum(map(len, groups))
@@ -178,3 +164,32 @@ def bootstrap_mean(
         sums += values[generator.integers(len(values), size=(resamples, len(values)))].sum(axis=1)
     low, high = np.quantile(sums / count, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(float(sum(v.sum() for v in groups)) / count, float(low), float(high), confidence, count)
+
+
+def compare_methods(
+    scores: Scores, metric: str, baseline: str, resamples: int = 2000, confidence: float = 0.95
+) -> list[Difference]:
+    """Differences of every method to the baseline, paired by frame: for each outfit, then for all together. A method's
+    baseline is that of its own variant where there is one, else the plain or the only one.
+    """
+    frames = [row for row in scores.frames if row.metric == metric]
+    methods = order_methods({method_key(row) for row in frames})
+    if baseline not in {*methods, *map(base_method, methods)}:
+        raise unknown_name("baseline", baseline, methods)
+    found = []
+    for method in methods:
+        other = find_counterpart(method, methods, baseline) or (baseline if baseline in methods else None)
+        if other in (None, method) or base_method(method) == "sampling":
+            continue
+        pairs = paired_differences(frames, metric, method, other)
+        groups = {outfit: [pairs[outfit]] for outfit in sorted(pairs)}
+        if len(pairs) > 1:
+            groups[ALL] = list(pairs.values())
+        for outfit, values in groups.items():
+            found.append(Difference(metric, outfit, method, other, bootstrap_mean(values, resamples, confidence)))
+    return found
+
+
+def differences_csv(found: Iterable[Difference]) -> str:
+    """All differences as tidy CSV, in the metrics' own units."""
+    return csv_text(COLUMNS, ((*d[:-1], *d.interval, METRICS[d.metric].unit) for d in found))

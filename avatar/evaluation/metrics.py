@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from avatar.checks import AvatarError, check_finite, check_shape
-from avatar.evaluation.crossings import crossing_faces
-from avatar.evaluation.views import normal_map_error, render_normals, silhouette_overlap, view_frame
+from avatar.evaluation import shapes
 from avatar.geometry.closest import closest_on_mesh
-from avatar.geometry.distances import normal_difference, point_to_plane, point_to_point
-from avatar.geometry.neighbours import k_nearest, nearest
+from avatar.geometry.neighbours import k_nearest, nearest, normal_difference, point_to_plane, point_to_point
 from avatar.geometry.surface import vertex_normals
 from avatar.records import Mesh, PointCloud, Scan
 
@@ -29,19 +27,13 @@ HOLE = 0.01  # metres of the true surface to the predicted one from which on it 
 
 
 class Comparison:
-    """What a metric sees of one frame: checked, in float64, neighbours searched once for all metrics.
-
-    ``points (N, 3)`` and ``normals (N, 3)`` of the prediction, ``scan (M, 3)`` and ``scan_normals (M, 3)``, float64
-    on the CPU, normals scaled to length one. ``mesh`` is the predicted mesh where there is one, ``body`` the posed
-    bare body.
+    """What a metric sees of one frame: checked, in float64, neighbours searched once for all metrics. ``points (N, 3)``
+    and ``normals (N, 3)`` of the prediction, ``scan (M, 3)`` and ``scan_normals (M, 3)``, float64 on the CPU, normals
+    scaled to length one. ``mesh`` is the predicted mesh where there is one, ``body`` the posed bare body. Raises
+    `AvatarError` on an empty cloud, wrong shapes, non-finite numbers or normals without direction.
     """
 
     def __init__(self, prediction: PointCloud, scan: Scan, body: Mesh | None = None, mesh: Mesh | None = None):
-        """Checks and converts one frame.
-
-        Raises:
-            AvatarError: on an empty cloud, wrong shapes, non-finite numbers or normals without direction.
-        """
         self.points, self.normals = _oriented("prediction", prediction.points, prediction.normals)
         self.scan, self.scan_normals = _oriented("scan", scan.points, scan.normals)
         self.body, self.mesh = body, mesh
@@ -56,6 +48,12 @@ class Comparison:
         """Index of the nearest predicted point to each scan point, ``(M,)``."""
         return nearest(self.scan[None], self.points[None])[0]
 
+    @property
+    def gaps(self) -> tuple[Tensor, Tensor]:
+        """Distances of predicted ``(N,)`` and of scan points ``(M,)`` to the nearest of the other cloud, metres."""
+        to_scan = (self.points - self.scan[self.scan_of_point]).norm(dim=-1)
+        return to_scan, (self.scan - self.points[self.point_of_scan]).norm(dim=-1)
+
     @cached_property
     def spacing(self) -> float:
         """Typical mean distance of a scan point to its `DISC_NEIGHBOURS` nearest ones, metres."""
@@ -69,21 +67,15 @@ class Comparison:
     @cached_property
     def normal_maps(self) -> tuple[Tensor, Tensor]:
         """Rendered normals of prediction and scan, discs as large as evenly spread points need (`render_normals`)."""
-        place = view_frame(self.scan)
+        place = shapes.view_frame(self.scan)
         return (
-            render_normals(self.points, self.normals, self.even_spacing, *place),
-            render_normals(self.scan, self.scan_normals, self.spacing, *place),
+            shapes.render_normals(self.points, self.normals, self.even_spacing, *place),
+            shapes.render_normals(self.scan, self.scan_normals, self.spacing, *place),
         )
 
     @cached_property
     def depths(self) -> Tensor:
-        """How deep predicted points lie under the bare body, positive inside; at most `PENETRATION_POINTS` of them.
-
-        The points are an even stride through the prediction.
-
-        Raises:
-            AvatarError: without a body.
-        """
+        """How deep `PENETRATION_POINTS` or fewer predicted points, an even stride, lie under the bare body, metres."""
         if self.body is None:
             raise AvatarError(
                 "body: penetration needs the posed bare body and its faces, and none was given; load frames from a "
@@ -133,9 +125,8 @@ ACCELERATION = Unit("m/frame^2", 1e3, "mm/frame²")
 
 @dataclass(frozen=True)
 class Metric:
-    """A named number: values are kept in ``unit`` and shown as ``value * scale`` in ``shown_in``.
-
-    ``measure`` takes a `Comparison`, or, for a ``sequential`` metric, corresponding points ``(T, N, 3)``.
+    """A named number: values are kept in ``unit`` and shown as ``value * scale`` in ``shown_in``. ``measure`` takes a
+    `Comparison`, or, for a ``sequential`` metric, corresponding points ``(T, N, 3)``.
     """
 
     name: str
@@ -174,17 +165,12 @@ def metric(name: str, unit: Unit, **properties: bool) -> Callable[[Callable], Ca
     return add
 
 
-def find_metrics(names: Iterable[str]) -> list[Metric]:
-    """The metrics of these names, in their order.
-
-    Raises:
-        AvatarError: naming the unknown ones and all that there are.
-    """
+def find_metrics(names: Iterable[str], known: Mapping[str, Metric] = METRICS) -> list[Metric]:
+    """The metrics of these names, in their order; an `AvatarError` names the unknown ones and all that there are."""
     names = list(names)
-    unknown = [name for name in names if name not in METRICS]
-    if unknown:
-        raise AvatarError(f"metrics: unknown {', '.join(unknown)}; expected any of {', '.join(METRICS)}.")
-    return [METRICS[name] for name in names]
+    if unknown := [name for name in names if name not in known]:
+        raise AvatarError(f"metrics: unknown {', '.join(unknown)}; expected any of {', '.join(known)}.")
+    return [known[name] for name in names]
 
 
 @metric("cd_point", AREA)
@@ -235,10 +221,8 @@ def scan_to_surface(c: Comparison) -> Tensor:
 
 
 def scan_to_discs(scan: Tensor, points: Tensor, normals: Tensor, point_of_scan: Tensor, radius: float) -> Tensor:
-    """Distances from scan points to the disc at their nearest predicted point, ``(M,)`` metres.
-
-    A point cloud's surface for D_s2m: exact planes would hide holes (a plane runs on over them), bare points would
-    count their own spacing as error.
+    """Distances from scan points to the disc at their nearest predicted point, ``(M,)`` metres. A point cloud's surface
+    for D_s2m: planes would hide holes, bare points count their own spacing as error.
     """
     away = scan - points[point_of_scan]
     height = (away * normals[point_of_scan]).sum(dim=-1)
@@ -264,26 +248,17 @@ def f_score_5mm(c: Comparison) -> Tensor:
     """F-score at 5 mm: harmonic mean of the share of predicted points within 5 mm of a scan point and the share of
     scan points within 5 mm of a predicted point. Higher is better.
     """
-    return _f_score(c, 5e-3)
+    return f_score(*c.gaps, 5e-3)
 
 
 @metric("f_score_1cm", PERCENT, higher_is_better=True)
 def f_score_1cm(c: Comparison) -> Tensor:
     """F-score at 1 cm: as f_score_5mm, within 1 cm. Higher is better."""
-    return _f_score(c, 1e-2)
-
-
-def _f_score(c: Comparison, threshold: float) -> Tensor:
-    to_scan = (c.points - c.scan[c.scan_of_point]).norm(dim=-1)
-    to_points = (c.scan - c.points[c.point_of_scan]).norm(dim=-1)
-    return f_score(to_scan, to_points, threshold)
+    return f_score(*c.gaps, 1e-2)
 
 
 def f_score(to_scan: Tensor, to_points: Tensor, threshold: float) -> Tensor:
-    """Harmonic mean of the shares of predicted and of scan points that have the other within a threshold.
-
-    ``to_scan (N,)`` and ``to_points (M,)`` are distances to the nearest point of the other cloud, metres.
-    """
+    """Harmonic mean of the shares of predicted ``(N,)`` and of scan ``(M,)`` distances within a threshold, metres."""
     precision = (to_scan <= threshold).double().mean()
     recall = (to_points <= threshold).double().mean()
     return 2 * precision * recall / (precision + recall).clamp(min=1e-12)
@@ -304,13 +279,18 @@ def normal_maps_apart(c: Comparison) -> Tensor:
     """Mean angle between rendered normal maps of prediction and scan where both are seen, six views 60° apart from 20°
     above the horizon, 192 x 192 pixels; points are discs as wide as evenly spread ones need to close.
     """
-    return normal_map_error(*c.normal_maps)
+    mine, theirs = c.normal_maps
+    both = mine.any(dim=-1) & theirs.any(dim=-1)
+    if not both.any():
+        return mine.new_tensor(180.0)
+    return torch.rad2deg((mine[both] * theirs[both]).sum(dim=-1).clamp(-1, 1).acos()).mean()
 
 
 @metric("silhouette", PERCENT, higher_is_better=True)
 def silhouettes_shared(c: Comparison) -> Tensor:
     """Silhouette overlap in the views of normal_map: intersection over union, all views together. Higher is better."""
-    return silhouette_overlap(*c.normal_maps)
+    mine, theirs = (maps.any(dim=-1) for maps in c.normal_maps)
+    return (mine & theirs).sum().double() / (mine | theirs).sum().clamp(min=1)
 
 
 @metric("holes", PERCENT)
@@ -339,7 +319,7 @@ def penetration_depth(c: Comparison) -> Tensor:
 @metric("self_intersection", PERCENT, needs_mesh=True)
 def self_intersection(c: Comparison) -> Tensor:
     """Share of the predicted mesh's faces that cross another face with which they share no vertex; meshes only."""
-    return torch.from_numpy(crossing_faces(c.mesh.vertices, c.mesh.faces)).double().mean()
+    return torch.from_numpy(shapes.crossing_faces(c.mesh.vertices, c.mesh.faces)).double().mean()
 
 
 @metric("uniformity", RATIO)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
@@ -19,13 +18,7 @@ from avatar.evaluation.plots import inline_svg, plot_losses
 from avatar.evaluation.tables import Table
 from avatar.io.npz import write_whole
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 COLUMNS = ("ground truth", "prediction", "template", "mesh", "error")
-WEBP = {"format": "WEBP", "quality": 90, "method": 4}
-
-
 STYLE = """
 :root { color-scheme: light dark; --page: #f6f6f3; --card: #fff; --ink: #1c2027; --soft: #646b76; --line: #e2e2dd;
   --accent: #2f6fc9; --missing: #9a6a12; --paper: #fff; }
@@ -123,7 +116,7 @@ class PictureRow:
 
 @dataclass(frozen=True)
 class ReportContent:
-    """What a report shows. Whatever is left empty is said to be missing on the page, never skipped."""
+    """What a report shows; pictures, tables and a training log that are not there are called missing on the page."""
 
     title: str
     subtitle: str = ""
@@ -132,29 +125,28 @@ class ReportContent:
     config_yaml: str = ""
     metrics_csv: Path | None = None
     tables: tuple[Table, ...] = ()
-    figures: tuple[tuple[str, Figure], ...] = ()  # more plots, each with its title, shown below the tables
-    columns: tuple[str, ...] = COLUMNS
     pictures: tuple[PictureRow, ...] = ()
     files: tuple[Path, ...] = ()
 
 
 def write_report(run_folder: str | Path, content: ReportContent) -> Path:
-    """Writes ``report.html`` into a run's folder and returns its path.
-
-    Raises:
-        AvatarError: when a picture is not an image, or a row has another number of pictures than columns.
-        DataError: when the training log is there and cannot be read.
+    """Writes ``report.html`` into a run's folder and returns its path. Raises `AvatarError` when a picture is not an
+    image, or a row has another number of pictures than columns, and `DataError` when the training log is there and
+    cannot be read.
     """
-    folder, text = Path(run_folder), content.config_yaml
-    settings = f"<pre>{escape(text)}</pre>" if text.strip() else _missing("No configuration was recorded.")
-    files = "".join(_file(folder, Path(file)) for file in content.files)
+    folder, log = Path(run_folder), content.metrics_csv
+    training = _missing(f"No training log{f' at {log}' if log else ''}, so there are no loss curves.")
+    if log and Path(log).is_file():
+        training = f'<div class="plot">{inline_svg(plot_losses(log), "losses", "Loss terms over training steps")}</div>'
+    paragraphs = [f"<p>{escape(part)}</p>" for part in content.summary.split("\n\n")]
+    facts = [f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in content.facts.items()]
     sections = {
-        "Summary": _summary(content),
-        "Pictures": _pictures(content),
+        "Summary": f'{"".join(paragraphs)}\n<dl class="facts">{"".join(facts)}</dl>',
+        "Pictures": _pictures(content) if content.pictures else _missing("No pictures were made for this run."),
         "Metrics": _metrics(content),
-        "Training": _training(content.metrics_csv),
-        "Configuration": settings,
-        "Files": f'<ul class="files">{files}</ul>' if files else _missing("This run made no files."),
+        "Training": training,
+        "Configuration": f"<pre>{escape(content.config_yaml)}</pre>",
+        "Files": f'<ul class="files">{"".join(_file(folder, Path(file)) for file in content.files)}</ul>',
     }
     page = PAGE.substitute(
         title=escape(content.title),
@@ -172,17 +164,13 @@ def write_report(run_folder: str | Path, content: ReportContent) -> Path:
 
 
 def picture_source(image: np.ndarray) -> str:
-    """An image as a WebP data URI.
-
-    Raises:
-        AvatarError: when it is not ``(H, W, 3 or 4)`` uint8 with at least one pixel.
-    """
+    """An image ``(H, W, 3 or 4)`` uint8 as a WebP data URI; an `AvatarError` for any other or an empty one."""
     image = np.asarray(image)
     check_shape("image", image, "H W C")
     if image.dtype != np.uint8 or image.shape[2] not in (3, 4) or not image.size:
         raise AvatarError(f"image: expected (H, W, 3 or 4) uint8 pixels, got {image.shape} {image.dtype}.")
     data = io.BytesIO()
-    require("PIL.Image").fromarray(np.ascontiguousarray(image)).save(data, **WEBP)
+    require("PIL.Image").fromarray(np.ascontiguousarray(image)).save(data, format="WEBP", quality=90, method=4)
     return f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
 
 
@@ -190,73 +178,41 @@ def _missing(text: str) -> str:
     return f'<p class="missing">{escape(text)}</p>'
 
 
-def _summary(content: ReportContent) -> str:
-    paragraphs = [f"<p>{escape(part.strip())}</p>" for part in content.summary.split("\n\n") if part.strip()]
-    facts = [f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in content.facts.items()]
-    if facts:
-        paragraphs.append('<dl class="facts">' + "".join(facts) + "</dl>")
-    return "\n".join(paragraphs) or _missing("No summary was given.")
-
-
 def _pictures(content: ReportContent) -> str:
-    if not content.pictures:
-        return _missing("No pictures were made for this run.")
-    cells = [f'<div class="head">{escape(column)}</div>' for column in content.columns]
+    cells = [f'<div class="head">{escape(column)}</div>' for column in COLUMNS]
     for row in content.pictures:
-        if len(row.pictures) != len(content.columns):
+        if len(row.pictures) != len(COLUMNS):
             raise AvatarError(
-                f"pictures: expected {len(content.columns)} for {row.title!r} ({', '.join(content.columns)}; None "
+                f"pictures: expected {len(COLUMNS)} for {row.title!r} ({', '.join(COLUMNS)}; None "
                 f"where there is none), got {len(row.pictures)}."
             )
         cells.append(f'<div class="pose">{escape(row.title)}</div>')
-        cells += [_picture(picture, column) for picture, column in zip(row.pictures, content.columns)]
+        for picture, column in zip(row.pictures, COLUMNS):
+            cell = _missing(f"no {column}")
+            if picture is not None:
+                source, (height, width) = picture_source(picture.image), picture.image.shape[:2]
+                cell = f'<img src="{source}" alt="{escape(picture.alt)}" width="{width}" height="{height}">'
+                cell += f"<figcaption>{escape(picture.caption)}</figcaption>" if picture.caption else ""
+            cells.append(f"<figure>{cell}</figure>")
     grid = "\n".join(cells)
-    return f'<div class="wide"><div class="pictures" style="--columns:{len(content.columns)}">\n{grid}\n</div></div>'
-
-
-def _picture(picture: Picture | None, column: str) -> str:
-    if picture is None:
-        return f"<figure>{_missing('no ' + column)}</figure>"
-    source, (height, width) = picture_source(picture.image), picture.image.shape[:2]
-    caption = f"<figcaption>{escape(picture.caption)}</figcaption>" if picture.caption else ""
-    size = f'width="{width}" height="{height}"'
-    return f'<figure><img src="{source}" alt="{escape(picture.alt)}" {size}>{caption}</figure>'
+    return f'<div class="wide"><div class="pictures" style="--columns:{len(COLUMNS)}">\n{grid}\n</div></div>'
 
 
 def _metrics(content: ReportContent) -> str:
-    parts = [_table(table) for table in content.tables] or [_missing("No predictions of this run were scored.")]
-    for place, (title, figure) in enumerate(content.figures):
-        parts.append(f"<h3>{escape(title)}</h3>\n{_plot(figure, f'figure{place}', title)}")
+    parts = [] if content.tables else [_missing("No predictions of this run were scored.")]
+    for table in content.tables:
+        head = "".join(f'<th scope="col">{escape(column)}</th>' for column in (table.corner, *table.heads))
+        rows = []
+        for row in table.rows:
+            cells = "".join(f"<td>{escape(cell)}</td>" for cell in row.cells)
+            kind = ' class="summary"' if row.summary else ""
+            rows.append(f'<tr{kind}><th scope="row">{escape(row.label)}</th>{cells}</tr>')
+        body = f"<thead><tr>{head}</tr></thead>\n<tbody>" + "\n".join(rows) + "</tbody>"
+        parts.append(f'<h3>{escape(table.title)}</h3>\n<div class="wide"><table>{body}</table></div>')
     notes = dict.fromkeys(note for table in content.tables for note in table.notes)
-    if notes:
-        listed = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    if listed := "".join(f"<li>{escape(note)}</li>" for note in notes):
         parts.append(f'<h3>Definitions</h3>\n<ul class="notes">{listed}</ul>')
     return "\n".join(parts)
-
-
-def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{escape(column)}</th>' for column in (table.corner, *table.heads))
-    rows = []
-    for row in table.rows:
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row.cells)
-        kind = ' class="summary"' if row.summary else ""
-        rows.append(f'<tr{kind}><th scope="row">{escape(row.label)}</th>{cells}</tr>')
-    body = "\n".join(rows)
-    return (
-        f"<h3>{escape(table.title)}</h3>\n"
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table></div>'
-    )
-
-
-def _training(metrics_csv: Path | None) -> str:
-    if metrics_csv is None or not Path(metrics_csv).is_file():
-        place = f" at {metrics_csv}" if metrics_csv else ""
-        return _missing(f"No training log{place}, so there are no loss curves.")
-    return _plot(plot_losses(metrics_csv), "losses", "Loss terms over training steps")
-
-
-def _plot(figure: Figure, prefix: str, title: str) -> str:
-    return f'<div class="plot">{inline_svg(figure, prefix, title)}</div>'
 
 
 def _file(folder: Path, file: Path) -> str:

@@ -17,12 +17,10 @@ Row = TypeVar("Row", "Score", "FrameScore")
 
 @dataclass(frozen=True)
 class Score:
-    """One number of a results table: a metric's mean over the frames of one outfit for one method.
-
-    ``variant`` tells settings of a method apart, ``seed``, ``steps`` and ``seconds`` are those of its training,
-    ``points`` is the mean count of predicted points, ``commit`` the code that made it, ``dataset`` the outfit's,
-    ``fraction`` the share of the training frames that was trained on, ``split`` whose frames were scored. Files without
-    the last three are older.
+    """One number of a results table: a metric's mean over the frames of one outfit for one method. ``variant`` tells
+    settings of a method apart, ``seed``, ``steps``, ``seconds`` and ``fraction`` of the frames are of its training,
+    ``points`` is the mean count of predicted points, ``commit`` the code that made it. Files without the last three
+    columns are older.
     """
 
     table: str
@@ -67,40 +65,32 @@ class Scores:
     def __add__(self, other: Scores) -> Scores:
         return Scores(self.rows + other.rows, self.frames + other.frames)
 
-    def of_split(self, split: str) -> Scores:
-        """Those of one split alone."""
-        return Scores(*([row for row in rows if row.split == split] for rows in (self.rows, self.frames)))
-
-    def of_metrics(self, names: Collection[str]) -> Scores:
-        """Those of some metrics alone."""
-        rows = [row for row in self.rows if row.metric in names]
-        return Scores(rows, [frame for frame in self.frames if frame.metric in names])
+    def only(self, column: str, values: Collection[str]) -> Scores:
+        """Those with one of some values in a column: of some splits, or metrics."""
+        return Scores(*([row for row in rows if getattr(row, column) in values] for rows in (self.rows, self.frames)))
 
 
 def write_scores(path: str | Path, scores: Scores) -> None:
-    """Writes the means to a CSV and single frames, if any, to ``<stem>.frames.csv`` beside it, whole or not at all.
-
-    Numbers are written so that reading gives back the same bits.
-    """
+    """Writes means to a CSV and single frames, if any, to ``<stem>.frames.csv`` beside it, so that no bit is lost."""
     path = Path(path)
-    _write_rows(path, Score, scores.rows)
-    if scores.frames:
-        _write_rows(frames_path(path), FrameScore, scores.frames)
-    else:
-        frames_path(path).unlink(missing_ok=True)
+    for file, kind, rows in ((path, Score, scores.rows), (frames_path(path), FrameScore, scores.frames)):
+        if rows or kind is Score:
+            write_whole(file, csv_text((f.name for f in fields(kind)), map(astuple, rows)).encode())
+        else:
+            file.unlink(missing_ok=True)
 
 
-def read_scores(path: str | Path) -> Scores:
-    """Reads what `write_scores` wrote; the file of single frames may be missing.
-
-    Raises:
-        DataError: naming the file and what is wrong: missing, other columns, or a value of the wrong kind.
+def read_scores(*paths: str | Path) -> Scores:
+    """Reads what `write_scores` wrote to one or several files; those of single frames may be missing. Raises
+    `DataError` for a missing file, other columns, or a value of the wrong kind.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise DataError(path, "there are no scores here.", "Run tools/evaluate.py first.")
-    beside = frames_path(path)
-    return Scores(_from_csv(Score, path), _from_csv(FrameScore, beside) if beside.is_file() else [])
+    scores = Scores()
+    for path in map(Path, paths):
+        if not path.is_file():
+            raise DataError(path, "there are no scores here.", "Run tools/evaluate.py first.")
+        beside = frames_path(path)
+        scores += Scores(_from_csv(Score, path), _from_csv(FrameScore, beside) if beside.is_file() else [])
+    return scores
 
 
 def frames_path(path: Path) -> Path:
@@ -113,10 +103,6 @@ def csv_text(columns: Iterable[str], rows: Iterable[Iterable]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows((columns, *rows))
     return text.getvalue()
-
-
-def _write_rows(path: Path, kind: type[Row], rows: Iterable[Row]) -> None:
-    write_whole(path, csv_text((f.name for f in fields(kind)), map(astuple, rows)).encode())
 
 
 def _from_csv(kind: type[Row], path: Path) -> list[Row]:

@@ -1,14 +1,15 @@
-"""Scoring of predictions on disk, one PLY a frame, whoever made them."""
+"""Scoring of predictions on disk, one PLY a frame, whoever made them, and of the floors every comparison stands on."""
 
 from __future__ import annotations
 
 import functools
 import logging
+import math
 import zlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,26 +18,24 @@ from avatar.checks import AvatarError, DataError
 from avatar.data.outfits import Outfit
 from avatar.evaluation.metrics import METRIC_NAMES, Comparison, Metric, find_metrics
 from avatar.evaluation.scores import FrameScore, Score, Scores
+from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.progress import tracked
-from avatar.records import Frame, Mesh, Scan
+from avatar.records import Frame, Mesh, PointCloud, Scan
 
 log = logging.getLogger(__name__)
 
 # What a score is made by: metrics, floors and the draw of points, and the readers of data sets. Not how tables and
 # plots are made of scores, nor how what is scored was trained: that shows in the hash of the prediction's file.
-SOURCE = ("avatar.evaluation.floors", "avatar.data.layouts")
+SOURCE = ("avatar.evaluation.scoring", "avatar.data.layouts")
 SIZE_RATIO = 5.0  # a prediction this many times larger or smaller than its scan is in other units
 
 
 @dataclass
 class ScoreConfig:
-    """How predictions are scored.
-
-    The same scan points are drawn for every method: a frame's draw depends on ``seed`` and its name alone.
-    """
+    """How predictions are scored: all against the same scan points, drawn by ``seed`` and the frame's name alone."""
 
     scan_points: int = 40_000  # scan points compared a frame; all of them where a scan has fewer
     metrics: list[str] = field(default_factory=lambda: list(METRIC_NAMES))
@@ -64,17 +63,24 @@ class Label:
     split: str = "test"
 
 
-@dataclass(frozen=True)
 class Memory:
-    """Values that were measured before, each metric of each frame for itself.
-
-    ``ledger`` keeps them (None: nothing is kept), ``what`` says in words what is scored, and ``made_of`` gives the hash
-    of all that a frame's values are made of.
+    """Values of one method on an outfit that were measured before, each metric of each frame for itself. ``ledger``
+    keeps them (None: nothing is kept); ``what`` is the method in words. ``source`` are the modules that make the values
+    (see `keyed`), ``made`` is what else they depend on; functions are asked for each frame by its name.
     """
 
-    ledger: Ledger | None
-    what: str
-    made_of: Callable[[str], str]
+    def __init__(
+        self, ledger: Ledger | None, what: str, outfit: Any, split: str, source: tuple[str, ...] = SOURCE, **made: Any
+    ):
+        self.ledger, self.what = ledger, f"{what} {outfit.name} {split}"
+
+        @functools.cache
+        def made_of(name: str) -> str:
+            parts = {key: value(name) if callable(value) else value for key, value in made.items()}
+            scanner = vars(outfit.scanner) if hasattr(outfit, "scanner") else None
+            return keyed(source, frame=outfit.digest(split, name), scanner=scanner, **parts)
+
+        self.made_of = made_of  # the hash of all that a frame's values are made of
 
     def recall(self, frame: str, metrics: Iterable[str]) -> tuple[dict[str, float], int]:
         """The known values of a frame by metric, and its point count; nothing that was made of something else."""
@@ -92,32 +98,12 @@ class Memory:
             self.ledger.record_notes(self.made_of(frame), notes)
 
 
-def remember(ledger: Ledger | None, what: str, outfit: Any, split: str, source: tuple[str, ...], **made: Any) -> Memory:
-    """The memory of one method's scores on an outfit.
+class Contender(NamedTuple):
+    """What is scored: its label, what metrics see of a frame (with its ``points (N, 3)``), and its memory."""
 
-    Args:
-        ledger: where it is kept.
-        what: the method, in words.
-        outfit, split: what is scored: a data set's outfit, with `digest` and maybe a ``scanner``.
-        source: the modules that make the values, see `keyed`.
-        made: what else the values depend on; functions are asked for each frame by its name.
-    """
-
-    @functools.cache
-    def made_of(name: str) -> str:
-        parts = {key: value(name) if callable(value) else value for key, value in made.items()}
-        scanner = vars(outfit.scanner) if hasattr(outfit, "scanner") else None
-        return keyed(source, frame=outfit.digest(split, name), scanner=scanner, **parts)
-
-    return Memory(ledger, f"{what} {outfit.name} {split}", made_of)
-
-
-def remember_scores(
-    ledger: Ledger | None, what: str, outfit: Any, split: str, config: ScoreConfig, **made: Any
-) -> Memory:
-    """The memory of scores of points; none for motion, whose frames depend on each other."""
-    drawn = {"scan_points": config.scan_points, "seed": config.seed}
-    return remember(None if config.motion else ledger, what, outfit, split, SOURCE, **drawn, **made)
+    label: Label
+    compare: Callable[[Frame], Any]
+    memory: Memory
 
 
 def score_predictions(
@@ -129,25 +115,10 @@ def score_predictions(
     meshes: str | Path | None = None,
     ledger: Ledger | None = None,
 ) -> Scores:
-    """Scores a folder of predictions, ``<frame>.ply`` with normals for every frame of the split.
-
-    Args:
-        folder: the predictions. Files that belong to no frame are ignored with a warning.
-        outfit: where the true frames come from: its ``name``, ``dataset``, `frames` and `load`; penetration is
-            scored where it has a ``template``.
-        split: which of its splits.
-        config: metrics and point counts.
-        label: method, variant and training facts for the rows.
-        meshes: a folder of predicted meshes, ``<frame>.ply`` or ``.obj``, which s2m_cm and normal_consistency then
-            measure instead of the points; None for point methods.
-        ledger: where values are kept, so that only new or changed ones are measured; None measures all.
-
-    Returns:
-        `Scores`: one row a metric, and the single frames.
-
-    Raises:
-        DataError: when frames have no prediction (naming them), or one is in other units than its scan.
-        AvatarError: naming the frame, when a prediction is not valid.
+    """Scores a folder of predictions, ``<frame>.ply`` with normals for every frame of a split of an outfit. ``meshes``
+    is a folder of predicted meshes, ``.ply`` or ``.obj``, which s2m_cm and normal_consistency then measure instead of
+    the points. Values that ``ledger`` keeps are not measured again. Raises `DataError` when frames have no prediction
+    (naming them) or one is in other units than its scan, and `AvatarError` naming a frame that is not valid.
     """
     names = frame_names(outfit, split)
     clouds = find_predictions(Path(folder), names, (".ply",))
@@ -167,14 +138,67 @@ def score_predictions(
     def made_of(name: str) -> list[str]:
         return [file_digest(files[name]) for files in (clouds, surfaces) if files]
 
-    memory = remember_scores(ledger, "predictions", outfit, split, config, predicted=made_of)
-    return score_frames(outfit, split, names, config, label, compare, memory, bool(surfaces))
+    memory = remember_points(ledger, "predictions", outfit, split, config, predicted=made_of)
+    metrics = [metric for metric in find_metrics(config.metrics) if surfaces or not metric.needs_mesh]
+    return score_frames(outfit, split, names, metrics, [Contender(label, compare, memory)], config.motion)
 
 
-def posed_body(outfit: Outfit, frame: Frame) -> Mesh | None:
-    """The bare body under a frame as a mesh, or None where the outfit has no template to take faces from."""
-    template = getattr(outfit, "template", None)
-    return None if template is None else Mesh(frame.body.vertices, np.asarray(template.faces))
+def measure_floors(
+    outfit: Outfit, split: str, config: ScoreConfig, points: int, commit: str = "", ledger: Ledger | None = None
+) -> Scores:
+    """Scores floors as if they were predictions of so many ``points``, each frame for itself. ``sampling`` is a second
+    sampling of the true surface: what a perfect surface scores. Outfits without ``resample`` have their scan points
+    split into halves instead, variant ``halves``: with fewer points that floor is too high. ``body`` are points spread
+    area-uniformly over the posed bare body.
+    """
+    resample, config = getattr(outfit, "resample", None), replace(config, motion=False)
+
+    def sampling(frame: Frame) -> Comparison:
+        scan = draw_scan(frame, config)
+        if resample is None:
+            order = frame_generator(frame.name, config.seed + 1).permutation(len(scan.points))
+            halves = map(np.sort, np.array_split(order, 2))
+            again, scan = (Scan(scan.points[half], scan.normals[half]) for half in halves)
+        else:
+            again = resample(split, frame.name, points, seed=config.seed + 1)
+            if (again.points[:10, None] == frame.scan.points).all(axis=2).any(axis=1).all():
+                raise AvatarError("resample: expected another sampling of the surface, got the scan's own points.")
+        return Comparison(PointCloud(again.points, again.normals), scan, posed_body(outfit, frame))
+
+    def bare(frame: Frame) -> Comparison:
+        body = posed_body(outfit, frame)
+        return Comparison(sample_body(body, points, config.seed), draw_scan(frame, config), body)
+
+    if resample is None:
+        log.warning("%s: no true surface to sample again, so the sampling floor compares scan halves.", outfit.name)
+    contenders = []
+    for floor, compare, variant in (("sampling", sampling, "" if resample else "halves"), ("body", bare, "")):
+        memory = remember_points(ledger, floor, outfit, split, config, points=points)
+        contenders.append(Contender(Label(floor, variant=variant, commit=commit, split=split), compare, memory))
+    metrics = [metric for metric in find_metrics(config.metrics) if not metric.needs_mesh]
+    return score_frames(outfit, split, frame_names(outfit, split), metrics, contenders)
+
+
+def remember_points(
+    ledger: Ledger | None, what: str, outfit: Any, split: str, config: ScoreConfig, **made: Any
+) -> Memory:
+    """The memory of scores of points; none for motion, whose frames depend on each other."""
+    drawn = {"scan_points": config.scan_points, "seed": config.seed}
+    return Memory(None if config.motion else ledger, what, outfit, split, **drawn, **made)
+
+
+def posed_body(outfit: Outfit, frame: Frame) -> Mesh:
+    """The bare body under a frame."""
+    return Mesh(frame.body.vertices, np.asarray(outfit.template.faces))
+
+
+def sample_body(body: Mesh, points: int, seed: int) -> PointCloud:
+    """Points spread area-uniformly over a mesh, with interpolated vertex normals."""
+    vertices = torch.from_numpy(np.asarray(body.vertices, np.float64))
+    faces = torch.from_numpy(np.asarray(body.faces, np.int64))
+    samples = sample_surface(vertices, faces, points, torch.Generator().manual_seed(seed))
+    normals = torch.nn.functional.normalize(interpolate(vertex_normals(vertices, faces), samples), dim=-1)
+    return PointCloud(interpolate(vertices, samples).numpy(), normals.numpy())
 
 
 def draw_scan(frame: Frame, config: ScoreConfig) -> Scan:
@@ -182,13 +206,8 @@ def draw_scan(frame: Frame, config: ScoreConfig) -> Scan:
     count = len(frame.scan.points)
     if count <= config.scan_points:
         return frame.scan
-    chosen = frame_generator(frame.name, config.seed).permutation(count)[: config.scan_points]
-    return pick_points(frame.scan, np.sort(chosen))
-
-
-def pick_points(scan: Scan, ids: np.ndarray) -> Scan:
-    """Some of a scan's points, with their normals alone."""
-    return Scan(scan.points[ids], scan.normals[ids])
+    chosen = np.sort(frame_generator(frame.name, config.seed).permutation(count)[: config.scan_points])
+    return Scan(frame.scan.points[chosen], frame.scan.normals[chosen])
 
 
 def frame_generator(name: str, seed: int) -> np.random.Generator:
@@ -197,93 +216,91 @@ def frame_generator(name: str, seed: int) -> np.random.Generator:
 
 
 def frame_names(outfit: Outfit, split: str) -> list[str]:
-    """The names of a split's frames; a split without any is an error."""
-    names = list(outfit.frames(split))
-    if not names:
-        raise AvatarError(f"split: outfit {outfit.name} has no frames in {split!r}.")
-    return names
+    """The names of a split's frames, in time."""
+
+    def in_time(name: str) -> tuple[str, int, str]:
+        sequence, _, number = name.rpartition(".")
+        return sequence, int(number) if number.isdecimal() else 0, name
+
+    return sorted(outfit.frames(split), key=in_time)
 
 
 def find_predictions(folder: Path, names: Sequence[str], suffixes: tuple[str, ...] = (".ply",)) -> dict[str, Path]:
-    """The file of every frame in a folder of predictions; files of no frame are a warning.
-
-    Raises:
-        DataError: when there is no such folder, or naming the frames that have no file.
-    """
+    """The file of every frame in a folder of predictions; missing ones are refused, files of no frame a warning."""
     if not folder.is_dir():
         raise DataError(folder, "there is no such folder of predictions.", "Run tools/predict.py first.")
+
+    def some(names: Sequence[str]) -> str:
+        return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
     there = {path.name: path for path in sorted(folder.iterdir()) if path.suffix in suffixes}
     found = {name: there.pop(f"{name}{suffix}") for name in names for suffix in suffixes if f"{name}{suffix}" in there}
-    missing = [name for name in names if name not in found]
-    if missing:
+    if missing := [name for name in names if name not in found]:
         raise DataError(
             folder,
-            f"{len(missing)} of {len(names)} frames have no prediction ({', '.join(suffixes)}): {_some(missing)}.",
+            f"{len(missing)} of {len(names)} frames have no prediction ({', '.join(suffixes)}): {some(missing)}.",
             "Predict them, or score the split that was predicted.",
         )
     if there:
-        log.warning("%s: ignored %d files that belong to no frame: %s.", folder, len(there), _some(there))
+        log.warning("%s: ignored %d files that belong to no frame: %s.", folder, len(there), some(list(there)))
     return found
-
-
-def _some(names: Iterable[str]) -> str:
-    names = list(names)
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def score_frames(
     outfit: Outfit,
     split: str,
-    names: list[str],
-    config: ScoreConfig,
-    label: Label,
-    compare: Callable[[Frame], Comparison],
-    memory: Memory,
-    meshes: bool = False,
+    names: Sequence[str],
+    metrics: Sequence[Metric],
+    contenders: Sequence[Contender],
+    motion: bool = False,
+    partial: bool = False,
 ) -> Scores:
-    """Every metric of every frame, and their means.
-
-    Metrics of meshes are measured where ``meshes`` says that every frame has one. ``compare`` makes the `Comparison` of
-    a frame. Errors it or a metric raises are passed on with the frame's name. Values that ``memory`` knows are not
-    measured again.
+    """Every metric of every frame of some contenders, frame by frame, and their means. Values that a memory knows are
+    not measured again; where they may be ``partial``, those that a frame does not have (not finite) are left out.
+    Errors are passed on with the frame's name. ``motion`` measures metrics of sequences too.
     """
-    metrics = [m for m in find_metrics(config.metrics) if meshes or not m.needs_mesh]
-    if not getattr(outfit, "template", None) and any(m.needs_body for m in metrics):
-        metrics = [m for m in metrics if not m.needs_body]
-        log.warning("%s: no template, so penetration into the body is not scored.", outfit.name)
     frames: list[FrameScore] = []
-    counts, window = [], []
-    for name in tracked(sorted(names, key=_in_time), f"score {label.method} on {outfit.name}"):
-        values, points = memory.recall(name, [m.name for m in metrics])
-        missing = [m for m in metrics if not m.sequential and m.name not in values]
-        if missing or config.motion:
-            try:
-                comparison = compare(outfit.load(split, name))
-                new = {m.name: float(m.measure(comparison)) for m in missing}
-                if config.motion:
-                    window = [*window, (name, comparison.points)][-3:]
-                    new |= _measure_sequence([m for m in metrics if m.sequential], window)
-            except DataError:
-                raise
-            except AvatarError as error:
-                raise AvatarError(f"outfit {outfit.name}, {label.method}, frame {name}: {error}") from error
-            points = len(comparison.points)
-            memory.note(name, new, points)
-            values |= new
-        counts.append(points)
-        frames += [
-            FrameScore(outfit.name, label.method, label.variant, label.seed, name, metric, float(value), label.split)
-            for metric, value in values.items()
-        ]
-    return Scores(mean_scores(frames, metrics, label, outfit.dataset, round(float(np.mean(counts)))), frames)
+    found: dict[Label, dict[str, list[float]]] = {c.label: {m.name: [] for m in metrics} for c in contenders}
+    counts: dict[Label, list[int]] = {c.label: [] for c in contenders}
+    window = []
+    for name in tracked(names, f"score {', '.join(c.label.method for c in contenders)} on {outfit.name}"):
+        frame = None
+        for label, compare, memory in contenders:
+            values, points = memory.recall(name, [m.name for m in metrics])
+            missing = [m for m in metrics if not m.sequential and m.name not in values]
+            if missing or motion:
+                try:
+                    frame = frame or outfit.load(split, name)
+                    comparison = compare(frame)
+                    new = {m.name: float(m.measure(comparison)) for m in missing}
+                    if motion:
+                        window = [*window, (name, comparison.points)][-3:]
+                        new |= _measure_sequence([m for m in metrics if m.sequential], window)
+                except DataError:
+                    raise
+                except AvatarError as error:
+                    raise AvatarError(f"outfit {outfit.name}, {label.method}, frame {name}: {error}") from error
+                points = len(comparison.points)
+                memory.note(name, new, points)
+                values |= new
+            counts[label].append(points)
+            for metric, value in values.items():
+                if math.isfinite(value) or not partial:
+                    where = (outfit.name, label.method, label.variant, label.seed, name)
+                    frames.append(FrameScore(*where, metric, value, label.split))
+                    found[label][metric].append(value)
+    rows = []
+    for label, counted in counts.items():
+        made = asdict(label) | {"outfit": outfit.name, "dataset": outfit.dataset}
+        made["points"] = round(float(np.mean(counted)))
+        for metric in metrics:
+            if values := found[label][metric.name]:  # of the frames that have it
+                number = {"metric": metric.name, "value": float(np.mean(values)), "unit": metric.unit}
+                rows.append(Score(**made, **number, frames=len(values)))
+    return Scores(rows, frames)
 
 
-def _in_time(name: str) -> tuple[str, int, str]:
-    sequence, _, number = name.rpartition(".")
-    return sequence, int(number) if number.isdecimal() else 0, name
-
-
-def _measure_sequence(metrics: list[Metric], window: list[tuple[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+def _measure_sequence(metrics: list[Metric], window: list[tuple[str, torch.Tensor]]) -> dict[str, float]:
     """Metrics of motion at the last of three frames, where these follow each other in one sequence."""
     sequences, numbers = zip(*(name.rpartition(".")[::2] for name, _ in window))
     follow = len(window) == 3 and len(set(sequences)) == 1 and all(number.isdecimal() for number in numbers)
@@ -292,18 +309,4 @@ def _measure_sequence(metrics: list[Metric], window: list[tuple[str, torch.Tenso
     clouds = [points for _, points in window]
     if len({len(points) for points in clouds}) > 1:
         raise AvatarError(f"motion: expected one point count a sequence, got {[len(points) for points in clouds]}.")
-    return {metric.name: metric.measure(torch.stack(clouds)) for metric in metrics}
-
-
-def mean_scores(
-    frames: Sequence[FrameScore], metrics: Iterable[Metric], label: Label, dataset: str, points: int
-) -> list[Score]:
-    """Means over one method's frames of one outfit, of the metrics that at least one frame has."""
-    rows = []
-    for metric in metrics:
-        values = [frame.value for frame in frames if frame.metric == metric.name]
-        if values:
-            number = {"metric": metric.name, "value": float(np.mean(values)), "unit": metric.unit}
-            where = {"outfit": frames[0].outfit, "dataset": dataset, "frames": len(values), "points": points}
-            rows.append(Score(**asdict(label), **number, **where))
-    return rows
+    return {metric.name: float(metric.measure(torch.stack(clouds))) for metric in metrics}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from avatar.io.npz import write_whole
 from avatar.records import Mesh, PointCloud
 
 USD_FORMATS = (".usdc", ".usda", ".usd")
-PICTURE_FORMATS = {".gif": "GIF", ".webp": "WEBP"}
+PICTURE_FORMATS = {".gif": ("GIF", 10), ".webp": ("WEBP", 1)}  # with the length of a tick, ms
 
 
 def write_usd_points(
@@ -25,63 +26,43 @@ def write_usd_points(
 ) -> None:
     """Writes a sequence of oriented points as USD: one `Points` prim, time-sampled, counts may change.
 
-    Metres, y up. Widths are the points' own spacing, so that Blender or usdview show a closed surface.
-
-    Args:
-        path: ends in .usdc (compact), .usda (text) or .usd.
-        clouds: one a frame; may be a generator, and only one is in memory at a time.
-        fps: frames per second.
-        frames: the frames' numbers, rising, which become their time codes; 0, 1, 2, ... if None. Where numbers are
-            missing the frame before them is held.
-
-    Raises:
-        AvatarError: for no frames, wrong shapes, numbers, non-finite values or fps, or when usd-core is missing.
-        DataError: for another file name ending.
+    Metres, y up. Widths are the points' own spacing, so that Blender or usdview show a closed surface. ``path`` ends in
+    .usdc (compact), .usda (text) or .usd; of ``clouds``, one a frame, only one is in memory at a time. ``frames`` are
+    their numbers, rising, which become time codes (0, 1, 2, ... if None); where numbers are missing the frame before
+    them is held. Raises `AvatarError` for no frames, wrong shapes, numbers, non-finite values or fps, or without
+    usd-core; `DataError` for another file name ending.
     """
-    usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
     with _usd_stage(path, fps) as stage:
-        prim = usd_geom.Points.Define(stage, "/avatar/points")
-        prim.SetNormalsInterpolation(usd_geom.Tokens.vertex)
+        prim = require("pxr.UsdGeom").Points.Define(stage, "/avatar/points")
+        prim.SetNormalsInterpolation("vertex")
         for cloud, frame in _samples(stage, clouds, frames):
             check_oriented(cloud.points, cloud.normals)
             widths = 2 * disc_radii(np.asarray(cloud.points, np.float64))
-            prim.GetPointsAttr().Set(_vectors(vt, cloud.points), frame)
-            prim.GetNormalsAttr().Set(_vectors(vt, cloud.normals), frame)
-            prim.GetWidthsAttr().Set(vt.FloatArray.FromNumpy(widths.astype(np.float32)), frame)
-            prim.GetExtentAttr().Set(_extent(vt, cloud.points, widths.max() / 2), frame)
+            prim.GetPointsAttr().Set(_vectors(cloud.points), frame)
+            prim.GetNormalsAttr().Set(_vectors(cloud.normals), frame)
+            prim.GetWidthsAttr().Set(require("pxr.Vt").FloatArray.FromNumpy(widths.astype(np.float32)), frame)
+            prim.GetExtentAttr().Set(_extent(cloud.points, widths.max() / 2), frame)
 
 
 def write_usd_meshes(path: str | Path, meshes: Iterable[Mesh], fps: float, frames: Sequence[int] | None = None) -> None:
     """Writes a sequence of meshes as USD: one `Mesh` prim, time-sampled, whose triangles may change by frame.
 
     Metres, y up, right-handed, no subdivision; colours become ``displayColor``. Blender, Maya and Unreal read it.
-
-    Args:
-        path: ends in .usdc (compact), .usda (text) or .usd.
-        meshes: one a frame; may be a generator, and only one is in memory at a time.
-        fps, frames: as `write_usd_points`.
-
-    Raises:
-        AvatarError: for no frames, meshes that are not valid, numbers, fps, or when usd-core is missing.
-        DataError: for another file name ending.
+    Arguments and errors as `write_usd_points`; `AvatarError` for meshes that are not valid as well.
     """
-    usd_geom, vt = require("pxr.UsdGeom"), require("pxr.Vt")
     with _usd_stage(path, fps) as stage:
-        prim = usd_geom.Mesh.Define(stage, "/avatar/mesh")
-        prim.CreateSubdivisionSchemeAttr(usd_geom.Tokens.none)
-        prim.CreateOrientationAttr(usd_geom.Tokens.rightHanded)
+        prim = require("pxr.UsdGeom").Mesh.Define(stage, "/avatar/mesh")
+        prim.CreateSubdivisionSchemeAttr("none")
+        prim.CreateOrientationAttr("rightHanded")
         prim.CreateDoubleSidedAttr(True)
         for mesh, frame in _samples(stage, meshes, frames):
             check_mesh(mesh)
-            prim.GetPointsAttr().Set(_vectors(vt, mesh.vertices), frame)
-            counts = np.full(len(mesh.faces), 3, np.int32)
-            prim.GetFaceVertexCountsAttr().Set(vt.IntArray.FromNumpy(counts), frame)
-            corners = np.ascontiguousarray(mesh.faces, np.int32).reshape(-1)
-            prim.GetFaceVertexIndicesAttr().Set(vt.IntArray.FromNumpy(corners), frame)
-            prim.GetExtentAttr().Set(_extent(vt, mesh.vertices, 0.0), frame)
+            prim.GetPointsAttr().Set(_vectors(mesh.vertices), frame)
+            prim.GetFaceVertexCountsAttr().Set(_whole(np.full(len(mesh.faces), 3)), frame)
+            prim.GetFaceVertexIndicesAttr().Set(_whole(np.reshape(mesh.faces, -1)), frame)
+            prim.GetExtentAttr().Set(_extent(mesh.vertices, 0.0), frame)
             if mesh.colors is not None:
-                primvar = prim.CreateDisplayColorPrimvar(usd_geom.Tokens.vertex)
-                primvar.Set(_vectors(vt, mesh.colors), frame)
+                prim.CreateDisplayColorPrimvar("vertex").Set(_vectors(mesh.colors), frame)
 
 
 @contextmanager
@@ -119,11 +100,7 @@ def _samples(stage: Any, items: Iterable, frames: Sequence[int] | None) -> Itera
 
 
 def _numbered(items: Iterable, frames: Sequence[int] | None) -> Iterator[tuple[int, Any]]:
-    """Items with their frames' numbers; from 0 on if None.
-
-    Raises:
-        AvatarError: for no items, and for numbers that do not rise or are more or fewer than the items.
-    """
+    """Items with their frames' numbers, from 0 on if None; at least one, with a number each, and rising."""
     count = 0
     for count, item in enumerate(items, start=1):
         if frames is not None and (count > len(frames) or (count > 1 and frames[count - 1] <= frames[count - 2])):
@@ -134,12 +111,16 @@ def _numbered(items: Iterable, frames: Sequence[int] | None) -> Iterator[tuple[i
         raise AvatarError(f"frames: expected {wanted} to write, got {count or 'none'}.")
 
 
-def _vectors(vt: Any, values: np.ndarray) -> Any:
-    return vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+def _vectors(values: np.ndarray) -> Any:
+    return require("pxr.Vt").Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
-def _extent(vt: Any, points: np.ndarray, margin: float) -> Any:
-    return _vectors(vt, np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin]))
+def _whole(values: np.ndarray) -> Any:
+    return require("pxr.Vt").IntArray.FromNumpy(np.ascontiguousarray(values, np.int32))
+
+
+def _extent(points: np.ndarray, margin: float) -> Any:
+    return _vectors(np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin]))
 
 
 def _check_fps(fps: float) -> None:
@@ -150,19 +131,11 @@ def _check_fps(fps: float) -> None:
 def write_animation(
     path: str | Path, images: Sequence[np.ndarray], fps: float, frames: Sequence[int] | None = None
 ) -> None:
-    """Writes pictures as a film that loops: WebP in full colour, or GIF in 255 colours and steps of 10 ms.
+    """Writes ``(H, W, 3)`` uint8 pictures of one size as a film that loops: .webp, or .gif in 255 colours, 10 ms steps.
 
-    Each picture stands until the next one's time, so that a film is as long as its frames' numbers say.
-
-    Args:
-        path: ends in .webp or .gif.
-        images: ``(H, W, 3)`` uint8, all of one size.
-        fps: frames per second.
-        frames: the pictures' numbers, rising; 0, 1, 2, ... if None. The first one's is the beginning.
-
-    Raises:
-        AvatarError: for no pictures, different sizes, numbers or fps.
-        DataError: for another file name ending.
+    Each picture stands until the next one's time, so that a film is as long as its ``frames``' rising numbers say
+    (0, 1, 2, ... if None); the first one's is the beginning. Raises `AvatarError` for no pictures, different sizes,
+    numbers or fps; `DataError` for another file name ending.
     """
     path = Path(path)
     suffix = check_suffix(path, PICTURE_FORMATS, "a film")
@@ -174,13 +147,11 @@ def write_animation(
         check_shape("images", picture, f"{height} {width} 3")
     numbers = [number for number, _ in _numbered(images, frames)]
     pictures = [require("PIL.Image").fromarray(np.ascontiguousarray(picture, np.uint8)) for picture in images]
-    kind = PICTURE_FORMATS[suffix]
+    kind, tick = PICTURE_FORMATS[suffix]
     if kind == "GIF":
         pictures = [picture.quantize(255, dither=0) for picture in pictures]
-    tick = 10 if kind == "GIF" else 1  # ms
     ticks = np.rint((np.array([*numbers, numbers[-1] + 1]) - numbers[0]) * 1000 / fps / tick).astype(int)
     durations = [max(int(count), 1) * tick for count in np.diff(ticks)]
-    with tempfile.TemporaryDirectory() as folder:
-        film = Path(folder) / f"film{suffix}"
-        pictures[0].save(film, kind, save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=85)
-        write_whole(path, film.read_bytes())
+    film = io.BytesIO()
+    pictures[0].save(film, kind, save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=85)
+    write_whole(path, film.getvalue())

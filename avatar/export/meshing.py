@@ -2,23 +2,31 @@
 
 open3d crashes or hangs on bad input and, rarely, on good input. It therefore runs in a process of its own, gets
 checked arrays only, and a frame that kills it is one failed frame.
+
+Its surfaces are closed: caps across sleeves, necks and hems, which no points support, are trimmed. Dropping a fixed
+share of low-density vertices (POP's way) leaves ragged boundaries and also removes parts of closed surfaces, so support
+is measured against the points. A vertex is unsupported where its nearest points all lie to one side (their centroid is
+shifted along the surface as on a boundary, whatever their density) and nothing follows on the other, or where the
+nearest point is far. The surface is cut along the line between, through its triangles.
 """
 
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import threading
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from avatar.checks import AvatarError, DataError, check_oriented
-from avatar.export.poisson import FAILED, READY, SOLVED, serve
-from avatar.export.trimming import trim_surface
+from avatar.export.poisson import serve
+from avatar.geometry.trees import build_tree
 from avatar.invocation import install_line
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import FORMATS, check_mesh, write_mesh
@@ -32,6 +40,12 @@ MIN_POINTS = 100
 EXTENTS = (1e-3, 1e3)  # metres; outside, open3d hangs or the units are wrong
 GRACE_S = 5.0  # beyond timeout_s, for a worker that is stuck before or amid its answer
 START_TIMEOUT_S = 120.0  # importing open3d from a cold disk
+NEIGHBOURS = 24
+BOUNDARY_SHIFT = 4 / (3 * np.pi)  # centroid of a half disc, in radii: what a vertex on a straight boundary sees
+LOOK_AHEAD = 0.9  # share of the look-ahead ball that must be empty; its surface touches the vertex's own boundary
+SPACING_NEIGHBOUR = 8  # the point itself counted; its distance measures the local spacing
+HOLE_SPACINGS = 2.5  # random points leave gaps this many such distances wide
+BARELY = 1e-3  # how far below the cut forgiven vertices are put
 
 
 class MeshingError(AvatarError):
@@ -50,16 +64,10 @@ class PoissonConfig:
     memory_gb: float = 8.0  # address space of the worker, GiB; 0 for no limit
 
     def __post_init__(self):
-        for name, low, high in (
-            ("depth", 4, 12),
-            ("max_hole", 1e-3, 10),
-            ("min_part", 0, 1),
-            ("timeout_s", 0.001, 86400),
-            ("max_points", MIN_POINTS, 20_000_000),
-            ("memory_gb", 0, 1024),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
+        ranges = {"depth": (4, 12), "max_hole": (1e-3, 10), "min_part": (0, 1), "timeout_s": (0.001, 86400)}
+        ranges |= {"max_points": (MIN_POINTS, 20_000_000), "memory_gb": (0, 1024)}
+        for name, (low, high) in ranges.items():
+            if not low <= (value := getattr(self, name)) <= high:
                 raise AvatarError(f"{name}: expected a number from {low} to {high}, got {value}.")
 
 
@@ -73,8 +81,7 @@ class PoissonMesher:
 
     def __init__(self, config: PoissonConfig | None = None):
         self.config = config or PoissonConfig()
-        self._process = None
-        self._connection = None
+        self._process = self._connection = None
 
     def __enter__(self) -> PoissonMesher:
         return self
@@ -88,17 +95,10 @@ class PoissonMesher:
         return self._process.pid if self._process is not None else None
 
     def mesh(self, cloud: PointCloud) -> Mesh:
-        """The surface the points lie on, open where they leave it open.
+        """The surface, float32 and int64, of a cloud whose normals point outwards; open where the points leave it open.
 
-        Args:
-            cloud: ``points (N, 3)`` metres, ``normals (N, 3)`` pointing outwards, of any length but zero.
-
-        Returns:
-            A mesh with float32 vertices and int64 faces.
-
-        Raises:
-            MeshingError: for points that cannot be meshed, a timeout, or a worker that died; the reason is named.
-            AvatarError: when open3d cannot be imported.
+        Raises `MeshingError` for points that cannot be meshed, a timeout, or a worker that died, with the reason;
+        `AvatarError` when open3d cannot be imported.
         """
         points, normals = check_cloud(cloud, self.config.max_points)
         raw = self._solve(points, normals)
@@ -116,9 +116,8 @@ class PoissonMesher:
 
     def close(self) -> None:
         """Ends the worker. The next `mesh` starts another."""
-        if self._connection is not None:
-            self._connection.close()
         if self._process is not None:
+            self._connection.close()
             self._process.kill()
             self._process.join()
         self._process = self._connection = None
@@ -127,47 +126,42 @@ class PoissonMesher:
         """One job for the worker; whatever goes wrong, the next job finds a fresh one."""
         if self._process is None or not self._process.is_alive():
             self._start()
-        config, valid = self.config, False
+        config, answer = self.config, None
         watchdog = threading.Timer(config.timeout_s + GRACE_S, self._process.kill)  # a worker that does not even listen
         watchdog.start()
         try:
-            for array in (points, normals, np.array([config.depth], np.int32)):
-                self._connection.send_bytes(array)
+            self._connection.send((points, normals, config.depth))
             if not self._connection.poll(config.timeout_s):
                 raise MeshingError(f"no surface within timeout_s={config.timeout_s} s; depth={config.depth}.")
-            verdict = self._connection.recv_bytes()
-            if verdict == FAILED:
-                raise MeshingError(f"open3d: {self._connection.recv_bytes().decode()}")
-            vertices = np.frombuffer(self._connection.recv_bytes(), np.float64).reshape(-1, 3)
-            faces = np.frombuffer(self._connection.recv_bytes(), np.int32).reshape(-1, 3)
-            valid = verdict == SOLVED
-        except (EOFError, OSError) as error:
+            answer = self._connection.recv()
+            if isinstance(answer, str):
+                raise MeshingError(f"open3d: {answer}")
+        except (EOFError, OSError, pickle.UnpicklingError) as error:
             self._process.join(timeout=5)
-            code = self._process.exitcode
             raise MeshingError(
-                f"the meshing process died (exit code {code}) on {len(points)} points. Try a lower depth than "
-                f"{config.depth}, or more than memory_gb={config.memory_gb}."
+                f"the meshing process died (exit code {self._process.exitcode}) on {len(points)} points. Try a lower "
+                f"depth than {config.depth}, or more than memory_gb={config.memory_gb}."
             ) from error
         finally:
             watchdog.cancel()
-            if not valid:
+            if not isinstance(answer, tuple):
                 self.close()
-        return Mesh(vertices, faces)
+        return Mesh(*answer)
 
     def _start(self) -> None:
         self.close()
         context = multiprocessing.get_context("spawn")  # a forked copy of a threaded process may hang
         self._connection, far_end = context.Pipe()
-        memory = int(self.config.memory_gb * 2**30)
-        self._process = context.Process(target=serve, args=(far_end, memory), name="poisson", daemon=True)
+        arguments = (far_end, int(self.config.memory_gb * 2**30))
+        self._process = context.Process(target=serve, args=arguments, name="poisson", daemon=True)
         with interrupts_blocked():
             self._process.start()
         far_end.close()
         try:
             if not self._connection.poll(START_TIMEOUT_S):
+                self.close()
                 raise MeshingError(f"the meshing process did not start within {START_TIMEOUT_S} s.")
-            verdict = self._connection.recv_bytes()
-            reason = self._connection.recv_bytes().decode() if verdict != READY else ""
+            reason = self._connection.recv()
         except (EOFError, OSError) as error:
             self.close()
             raise AvatarError(
@@ -180,11 +174,7 @@ class PoissonMesher:
 
 
 def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points and unit normals as float64, after refusing all that is known to crash or hang open3d.
-
-    Raises:
-        MeshingError: naming the reason.
-    """
+    """Points and unit normals as float64; raises `MeshingError` for all that is known to crash or hang open3d."""
     try:
         dims = check_oriented(cloud.points, cloud.normals)
     except AvatarError as error:
@@ -209,11 +199,7 @@ def check_cloud(cloud: PointCloud, max_points: int) -> tuple[np.ndarray, np.ndar
 
 
 def require_poisson() -> None:
-    """Refuses a machine without open3d, in no time: it is not imported.
-
-    Raises:
-        AvatarError: with the line that installs it.
-    """
+    """Raises `AvatarError`, with the line to run, where open3d is not installed; it is not imported for that."""
     if find_spec("open3d") is None:
         raise AvatarError(f"meshing needs open3d. Run: {install_line('open3d')}")
 
@@ -225,12 +211,11 @@ class MeshingReport:
     done: tuple[str, ...] = ()
     skipped: tuple[str, ...] = ()
     failed: dict[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
 
 
 def mesh_folder(
-    predictions_dir: str | Path,
-    meshes_dir: str | Path,
+    predictions_dir: Path,
+    meshes_dir: Path,
     formats: tuple[str, ...] = ("ply", "obj", "glb"),
     frames: Iterable[str] | None = None,
     config: PoissonConfig | None = None,
@@ -239,23 +224,12 @@ def mesh_folder(
 
     Meshes made of the same cloud with the same settings are kept where their hashes are right, so that an interrupted
     run goes on where it stopped. A frame that fails does not stop the others; it is in the report with its reason.
-
-    Args:
-        predictions_dir: folder of oriented point clouds.
-        meshes_dir: folder to write to; made if need be.
-        formats: file name endings to write: ply, obj, glb, stl, off.
-        frames: names to mesh; all in the folder if None.
-        config: settings of the reconstruction.
-
-    Raises:
-        DataError: when there is nothing to mesh or a named frame is missing.
-        AvatarError: for another format, or when open3d is missing.
+    ``formats`` are among ply, obj, glb, stl, off; ``frames`` names to mesh, or None for all. Raises `DataError` when
+    there is nothing to mesh or a named frame is missing; `AvatarError` for another format, or without open3d.
     """
-    started = time.monotonic()
     unknown = [ending for ending in formats if f".{ending}" not in FORMATS]
     if unknown or not formats:
         raise AvatarError(f"formats: expected some of {' '.join(FORMATS)} without the dot, got {tuple(formats)}.")
-    predictions_dir, meshes_dir = Path(predictions_dir), Path(meshes_dir)
     there = sorted(path.stem for path in predictions_dir.glob("*.ply"))
     names = there if frames is None else list(frames)
     missing = sorted(set(names) - set(there))
@@ -264,11 +238,10 @@ def mesh_folder(
         raise DataError(predictions_dir, f"{what} in this folder.", "Run tools/predict.py first.")
     done, skipped, failed, ledger = [], [], {}, Ledger(meshes_dir)
     settings = config or PoissonConfig()
-    with PoissonMesher(config) as mesher:
+    made = [settings.depth, settings.max_hole, settings.min_part]
+    with PoissonMesher(settings) as mesher:
         for name in tracked(names, "mesh"):
             source = predictions_dir / f"{name}.ply"
-            targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
-            made = [getattr(settings, option) for option in ("depth", "max_hole", "min_part")]
             key = keyed(SOURCE, cloud=file_digest(source), formats=formats, poisson=made)
             if ledger.find(name, key):
                 skipped.append(name)
@@ -278,8 +251,101 @@ def mesh_folder(
             except (MeshingError, DataError) as error:
                 failed[name] = str(error)
                 continue
+            targets = [meshes_dir / f"{name}.{ending}" for ending in formats]
             for target in targets:
                 write_mesh(target, mesh)
             ledger.record(name, key, targets)
             done.append(name)
-    return MeshingReport(tuple(done), tuple(skipped), failed, time.monotonic() - started)
+    return MeshingReport(tuple(done), tuple(skipped), failed)
+
+
+def trim_surface(mesh: Mesh, cloud: PointCloud, max_hole: float, min_part: float) -> Mesh:
+    """The part of a reconstructed surface that the points, with unit normals, support; without unused vertices.
+
+    Gaps in the points up to ``max_hole`` metres wide stay closed, wider ones are opened; where points are so sparse
+    that such gaps are everywhere, a gap must be a few times their spacing. Connected parts with less than the share
+    ``min_part`` of the whole area are dropped. The mesh has no triangles when nothing is supported.
+    """
+    tree = build_tree(cloud.points)
+    near, _ = tree.query(cloud.points, k=min(SPACING_NEIGHBOUR, len(cloud.points)))
+    holes = np.maximum(max_hole, HOLE_SPACINGS * near[:, -1])
+    distances, ids = tree.query(mesh.vertices, k=min(NEIGHBOURS, len(cloud.points)))
+    holes = holes[ids[:, 0]]
+    across = cloud.normals[ids[:, 0]]  # on a thin finger the centroid lies inside, which makes no boundary
+    shifts = cloud.points[ids].mean(axis=1) - mesh.vertices
+    shifts -= (shifts * across).sum(axis=1, keepdims=True) * across
+    lengths = np.maximum(np.linalg.norm(shifts, axis=1), 1e-12)
+    excess = lengths / np.maximum(distances[:, -1], 1e-12) / BOUNDARY_SHIFT - 1
+    edge = np.flatnonzero(excess > 0)
+    reach = holes[edge] / 2
+    beyond, _ = tree.query(mesh.vertices[edge] - shifts[edge] / lengths[edge, None] * reach[:, None])
+    excess[edge[beyond < LOOK_AHEAD * reach]] = -BARELY  # something follows: a gap, not a boundary
+    excess = np.maximum(excess, distances[:, 0] / (holes / 2) - 1)
+    excess = _forgive_small_holes(mesh, excess, holes)
+    return drop_small_parts(cut_surface(mesh, excess), min_part)
+
+
+def _forgive_small_holes(mesh: Mesh, excess: np.ndarray, holes: np.ndarray) -> np.ndarray:
+    """Keeps unsupported patches smaller than a hole across: noise, fingertips, the tip of the nose."""
+    outside = excess > 0
+    labels = _vertex_parts(mesh.faces[outside[mesh.faces].all(axis=1)], len(mesh.vertices))
+    count = labels.max() + 1
+    low, high, allowed = np.full((count, 3), np.inf), np.full((count, 3), -np.inf), np.zeros(count)
+    np.minimum.at(low, labels, mesh.vertices)
+    np.maximum.at(high, labels, mesh.vertices)
+    np.maximum.at(allowed, labels, holes)
+    small = (np.linalg.norm(high - low, axis=1) < allowed)[labels]
+    return np.where(outside & small, -BARELY, excess)
+
+
+def cut_surface(mesh: Mesh, values: np.ndarray) -> Mesh:
+    """The part of a mesh where values ``(V,)`` at its vertices, linear in between, are at most zero; without colours.
+
+    Triangles that the zero line crosses are split along it, so the boundary is a line and not a row of teeth.
+    """
+    inside = values <= 0
+    corners = inside[mesh.faces]
+    kept = mesh.faces[corners.all(axis=1)]
+    crossed = mesh.faces[corners.any(axis=1) & ~corners.all(axis=1)]
+    alone = inside[crossed] == (inside[crossed].sum(axis=1) == 1)[:, None]  # the corner on its own side
+    order = (alone.argmax(axis=1)[:, None] + np.arange(3)) % 3
+    tip, left, right = np.take_along_axis(crossed, order, axis=1).T
+    pairs = np.sort(np.concatenate([np.stack([tip, left], 1), np.stack([tip, right], 1)]), axis=1)
+    edges, ids = np.unique(pairs, axis=0, return_inverse=True)
+    ids = ids.reshape(-1) + len(mesh.vertices)
+    to_left, to_right = ids[: len(tip)], ids[len(tip) :]
+    start, end = mesh.vertices[edges].astype(np.float64).swapaxes(0, 1)
+    first, second = values[edges].T
+    along = (first / np.where(first == second, 1, first - second))[:, None]
+    boundary = start + along * (end - start)
+    single = inside[tip]
+    pieces = [
+        kept,
+        np.stack([tip, to_left, to_right], axis=1)[single],
+        np.stack([left, right, to_left], axis=1)[~single],
+        np.stack([right, to_right, to_left], axis=1)[~single],
+    ]
+    return _compact(np.concatenate([mesh.vertices, boundary]), np.concatenate(pieces))
+
+
+def drop_small_parts(mesh: Mesh, min_share: float) -> Mesh:
+    """The mesh without connected parts whose share of the whole area is below ``min_share``."""
+    if not len(mesh.faces):
+        return mesh
+    labels = _vertex_parts(mesh.faces, len(mesh.vertices))[mesh.faces[:, 0]]
+    a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
+    areas = np.bincount(labels, np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    return _compact(mesh.vertices, mesh.faces[areas[labels] >= min_share * areas.sum()])
+
+
+def _vertex_parts(faces: np.ndarray, count: int) -> np.ndarray:
+    """Number of the connected part each of ``count`` vertices belongs to, joined by ``faces``."""
+    starts, ends = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
+    links = coo_array((np.ones(len(starts), bool), (starts, ends)), shape=(count, count))
+    return connected_components(links, directed=False)[1]
+
+
+def _compact(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """A mesh with only the vertices that are used, in their order."""
+    used, ids = np.unique(faces, return_inverse=True)
+    return Mesh(vertices[used], ids.reshape(-1, 3))

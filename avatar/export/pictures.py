@@ -7,10 +7,12 @@ drawn unlit by pyvista, so that a picture does not depend on a renderer's idea o
 from __future__ import annotations
 
 import ctypes
+import importlib
 import io
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -32,8 +34,7 @@ BACKGROUND = (0.957, 0.957, 0.945)
 KEY_LIGHT = np.array([-0.45, 0.65, 0.61])  # camera frame: from the upper left, before the person
 SHADOW, SHADOW_TINT = 0.42, np.array([0.93, 0.96, 1.05])  # share of light left in shadow, and its cooler tone
 DISC_CORNERS = 6
-DISC_NEIGHBOUR = 7  # the point itself counted
-DISC_SPACING = 1.0  # disc radius in distances to that neighbour: discs overlap, rims are not thickened
+DISC_NEIGHBOUR = 7  # the point itself counted; its distance is the radius: discs overlap, boundaries stay thin
 GL_LIBRARIES = ("libEGL.so.1", "libOSMesa.so.8", "libGLX.so.0")
 CLAY = (0.80, 0.74, 0.68)
 BACK_FACE = 0.42  # brightness of surfaces seen from behind
@@ -44,49 +45,32 @@ PICTURE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 @dataclass(frozen=True)
 class Camera:
-    """An orthographic camera: who it looks at and from where. Use one for all methods of one frame.
+    """An orthographic camera: who it looks at and from where. Use one for all methods of one frame."""
 
-    ``center`` the point in the middle of the picture, metres; ``extent`` metres from its top to its bottom;
-    ``azimuth`` degrees around the vertical, 0 before the person and 90 at the person's left; ``elevation``
-    degrees above the horizon; ``size`` pixels, width and height.
-    """
-
-    center: tuple[float, float, float]
-    extent: float
-    azimuth: float = 0.0
-    elevation: float = 0.0
-    size: tuple[int, int] = (640, 960)
+    center: tuple[float, float, float]  # in the middle of the picture, metres
+    extent: float  # metres from its top to its bottom
+    azimuth: float = 0.0  # degrees around the vertical, 0 before the person and 90 at the person's left
+    size: tuple[int, int] = (640, 960)  # pixels, width and height
 
     @property
     def axes(self) -> np.ndarray:
         """``(3, 3)`` rows right, up and towards the viewer, in the world."""
-        turn, lift = np.radians([self.azimuth, self.elevation])
-        towards = np.array([np.sin(turn) * np.cos(lift), np.sin(lift), np.cos(turn) * np.cos(lift)])
-        right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
-        return np.stack([right, np.cross(towards, right), towards])
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixel coordinates ``(N, 2)``, column and row from the upper left corner, of ``(N, 3)`` points."""
-        across, up, _ = self.axes @ (np.asarray(points, np.float64) - self.center).T
-        scale = self.size[1] / self.extent
-        return np.stack([self.size[0] / 2 + across * scale, self.size[1] / 2 - up * scale], axis=1)
+        turn = np.radians(self.azimuth)
+        return np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
 
     def seen_from(self, view: str) -> Camera:
         """The same framing from front, left, back, right, side (the left) or three_quarter."""
-        return replace(self, azimuth=_azimuth(view))
+        if view not in AZIMUTHS:
+            raise unknown_name("view", view, AZIMUTHS)
+        return replace(self, azimuth=AZIMUTHS[view])
 
 
 def frame_camera(
-    points: np.ndarray,
-    view: str = "front",
-    size: tuple[int, int] = (640, 960),
-    margin: float = 0.05,
-    elevation: float = 0.0,
+    points: np.ndarray, view: str = "front", size: tuple[int, int] = (640, 960), margin: float = 0.05
 ) -> Camera:
     """A camera that shows all of ``points (..., 3)`` from a named view, with a margin as share of the picture.
 
-    They stay in the picture when it turns around them (`Camera.seen_from`); frames of a sequence, stacked, get one
-    camera for all.
+    They stay in the picture when it turns around them (`Camera.seen_from`). Raises `AvatarError` for no points.
     """
     cloud = np.asarray(points, np.float64).reshape(-1, 3)
     if not len(cloud):
@@ -94,17 +78,9 @@ def frame_camera(
     check_finite("points", cloud)
     center = (cloud.min(axis=0) + cloud.max(axis=0)) / 2
     around = np.hypot(*(cloud - center)[:, [0, 2]].T).max()
-    upwards = np.abs(cloud[:, 1] - center[1]).max()
-    lift = np.radians(elevation)
-    up = upwards * np.cos(lift) + around * np.abs(np.sin(lift))
+    up = np.abs(cloud[:, 1] - center[1]).max()
     extent = 2 * max(up, around * size[1] / size[0], 1e-3) / (1 - 2 * margin)
-    return Camera(tuple(center.tolist()), float(extent), _azimuth(view), elevation, size)
-
-
-def _azimuth(view: str) -> float:
-    if view not in AZIMUTHS:
-        raise unknown_name("view", view, AZIMUTHS)
-    return AZIMUTHS[view]
+    return Camera(tuple(center.tolist()), float(extent), size=size).seen_from(view)
 
 
 def shade(normals: np.ndarray, colors: str | tuple | np.ndarray, camera: Camera) -> np.ndarray:
@@ -131,7 +107,7 @@ def disc_radii(points: np.ndarray) -> np.ndarray:
     distances, _ = build_tree(points).query(points, k=min(DISC_NEIGHBOUR, len(points)))
     spacing = distances.reshape(len(points), -1)[:, -1]
     typical = np.median(spacing)
-    return DISC_SPACING * np.maximum(np.clip(spacing, 0.7 * typical, 1.5 * typical), 1e-4)
+    return np.maximum(np.clip(spacing, 0.7 * typical, 1.5 * typical), 1e-4)
 
 
 def discs(points: np.ndarray, normals: np.ndarray, radii: np.ndarray) -> np.ndarray:
@@ -155,8 +131,7 @@ def draw(layers: list[tuple[Any, np.ndarray, str | None]], camera: Camera) -> np
             plotter.add_mesh(surface, scalars="shades", rgb=True, lighting=False, culling=culling)
         plotter.enable_anti_aliasing("ssaa")
         _, up, towards = camera.axes
-        center = np.array(camera.center)
-        plotter.camera_position = [center + towards * camera.extent * 2, center, up]
+        plotter.camera_position = [camera.center + towards * camera.extent * 2, camera.center, up]
         plotter.enable_parallel_projection()
         plotter.parallel_scale = camera.extent / 2
         plotter.reset_camera_clipping_range()
@@ -166,13 +141,17 @@ def draw(layers: list[tuple[Any, np.ndarray, str | None]], camera: Camera) -> np
 
 
 def load_pyvista() -> ModuleType:
-    """pyvista, once it is known that this machine can draw: VTK without a GL library ends the whole process."""
+    """pyvista, once it is known that this machine can draw: VTK without a GL library ends the whole process.
+
+    Mesa and triton each bring an LLVM, and loading triton's after VTK has drawn ends the process as well, whoever asks
+    for it (torch does for roma); so triton, where there is one, is loaded first.
+    """
+    with suppress(ImportError):
+        importlib.import_module("triton")
     if sys.platform == "linux":
         if not any(_loads(name) for name in GL_LIBRARIES):
-            raise AvatarError(
-                f"pictures need one of {', '.join(GL_LIBRARIES)}, and this machine has none. "
-                f"Run: {install_line('pyvista')}"
-            )
+            names, line = ", ".join(GL_LIBRARIES), install_line("pyvista")
+            raise AvatarError(f"pictures need one of {names}, and this machine has none. Run: {line}")
         if "DISPLAY" not in os.environ:
             os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
     return require("pyvista")
@@ -186,24 +165,13 @@ def _loads(library: str) -> bool:
 
 
 def render_points(
-    cloud: PointCloud,
-    camera: Camera | None = None,
-    colors: str | tuple | np.ndarray = "normals",
-    radius: float | None = None,
+    cloud: PointCloud, camera: Camera | None = None, colors: str | tuple | np.ndarray = "normals"
 ) -> np.ndarray:
-    """A picture of oriented points as overlapping discs, which reads as a surface; seen from behind it is darker.
+    """A picture ``(H, W, 3)`` uint8 of oriented points as overlapping discs; seen from behind they are darker.
 
-    Args:
-        cloud: ``points (N, 3)`` metres and ``normals (N, 3)``.
-        camera: where to look from; frames the cloud from the front if None.
-        colors: "normals" (in the camera's frame), one RGB colour, or ``(N, 3)`` RGB, all in [0, 1].
-        radius: of a disc, metres; from the spacing of the points if None.
-
-    Returns:
-        ``(H, W, 3)`` uint8.
-
-    Raises:
-        AvatarError: on wrong shapes, non-finite values, or when pictures cannot be made on this machine.
+    The camera frames the cloud from the front if None. ``colors`` are "normals" (in the camera's frame), one RGB
+    colour, or ``(N, 3)`` RGB, all in [0, 1]. Raises `AvatarError` on wrong shapes, non-finite values, or when pictures
+    cannot be made on this machine.
     """
     check_oriented(cloud.points, cloud.normals)
     points, normals = (np.asarray(values, np.float64) for values in (cloud.points, cloud.normals))
@@ -211,25 +179,16 @@ def render_points(
     facing = normals @ camera.axes[2]
     shades = shade(np.where(facing[:, None] < 0, -normals, normals), colors, camera)
     shades *= np.where(facing < 0, BACK_FACE, 1.0)[:, None]
-    corners = discs(points, normals, disc_radii(points) if radius is None else np.full(len(points), radius))
+    corners = discs(points, normals, disc_radii(points))
     faces = np.arange(corners.shape[0] * DISC_CORNERS).reshape(-1, DISC_CORNERS)
     surface = load_pyvista().PolyData.from_regular_faces(corners.reshape(-1, 3), faces)
     return draw([(surface, shades.repeat(DISC_CORNERS, axis=0), None)], camera)
 
 
 def render_mesh(mesh: Mesh, camera: Camera | None = None, colors: str | tuple | np.ndarray | None = None) -> np.ndarray:
-    """A picture of a mesh, smooth shaded; the inside of an open surface is darker.
+    """A picture ``(H, W, 3)`` uint8 of a mesh, smooth shaded; the inside of an open surface is darker.
 
-    Args:
-        mesh: the mesh.
-        camera: where to look from; frames the mesh from the front if None.
-        colors: "normals", one RGB colour or ``(V, 3)`` RGB in [0, 1]; the mesh's own or clay if None.
-
-    Returns:
-        ``(H, W, 3)`` uint8.
-
-    Raises:
-        AvatarError: for a mesh that is not valid, or when pictures cannot be made on this machine.
+    Camera, colours and errors as `render_points`, with colours a vertex: the mesh's own or clay if None.
     """
     check_mesh(mesh)
     camera = camera or frame_camera(mesh.vertices)
@@ -242,38 +201,18 @@ def render_mesh(mesh: Mesh, camera: Camera | None = None, colors: str | tuple | 
     return draw([(surface, outside, "back"), (surface.copy(), inside, "front")], camera)
 
 
-def render_error(
-    cloud: PointCloud,
-    errors: np.ndarray,
-    max_error: float,
-    camera: Camera | None = None,
-    colormap: str = "turbo",
-) -> np.ndarray:
-    """A picture of points coloured by their error; zero is the low end of the map, ``max_error`` its high end.
-
-    Args:
-        cloud: the points with normals.
-        errors: ``(N,)`` metres, not negative.
-        max_error: metres.
-        camera: as for `render_points`.
-        colormap: a name matplotlib knows.
-
-    Returns:
-        ``(H, W, 3)`` uint8.
-    """
+def render_error(cloud: PointCloud, errors: np.ndarray, max_error: float, camera: Camera | None = None) -> np.ndarray:
+    """A picture, as `render_points`, of points coloured by their errors ``(N,)``, metres, from 0 to ``max_error``."""
     check_shape("errors", errors, "N", N=len(cloud.points))
     check_finite("errors", errors)
     if not max_error > 0:
         raise AvatarError(f"max_error: expected a positive number of metres, got {max_error}.")
-    return render_points(cloud, camera, map_colors(errors / max_error, colormap))
+    return render_points(cloud, camera, map_colors(errors / max_error))
 
 
-def map_colors(values: np.ndarray, colormap: str = "turbo") -> np.ndarray:
+def map_colors(values: np.ndarray) -> np.ndarray:
     """RGB colours ``(..., 3)`` in [0, 1] of values in [0, 1]; values outside take the colour of the nearer end."""
-    maps = require("matplotlib").colormaps
-    if colormap not in maps:
-        raise AvatarError(f"colormap: expected a name known to matplotlib (turbo, viridis), got {colormap!r}.")
-    return maps[colormap](np.clip(values, 0, 1))[..., :3]
+    return require("matplotlib").colormaps["turbo"](np.clip(values, 0, 1))[..., :3]
 
 
 def contact_sheet(
@@ -282,19 +221,10 @@ def contact_sheet(
     column_labels: Sequence[str] = (),
     gap: int = 8,
 ) -> np.ndarray:
-    """One picture of many of one size, in rows and columns with labels at the left and on top.
+    """One picture of many ``(H, W, 3)`` uint8, in rows and columns ``gap`` pixels apart, with labels left and on top.
 
-    Args:
-        rows: rows of ``(H, W, 3)`` uint8 pictures; a short row ends in empty places.
-        row_labels: one a row, or none; written upwards.
-        column_labels: one a column, or none.
-        gap: pixels between pictures.
-
-    Returns:
-        ``(H', W', 3)`` uint8.
-
-    Raises:
-        AvatarError: when pictures differ in size or labels do not fit the rows and columns.
+    A short row ends in empty places. Raises `AvatarError` when pictures differ in size, or labels are neither one a row
+    or column nor none.
     """
     pictures = [picture for row in rows for picture in row]
     if not pictures:
@@ -304,32 +234,32 @@ def contact_sheet(
         if picture.shape != pictures[0].shape:
             raise AvatarError(f"rows: expected pictures of one size, got {picture.shape} and {pictures[0].shape}.")
     columns = max(len(row) for row in rows)
-    for name, labels, count in (("row", row_labels, len(rows)), ("column", column_labels, columns)):
+    for name, labels, count in ("row", row_labels, len(rows)), ("column", column_labels, columns):
         if labels and len(labels) != count:
             raise AvatarError(f"{name}_labels: expected {count} or none, got {len(labels)}.")
     height, width = pictures[0].shape[:2]
     letter = max(12, height // 32)
     left, top = (2 * letter if row_labels else 0), (2 * letter if column_labels else 0)
-    shape = (top + len(rows) * (height + gap) - gap, left + columns * (width + gap) - gap, 3)
-    sheet = np.full(shape, PAPER, np.uint8)
-    for i, row in enumerate(rows):
-        for j, picture in enumerate(row):
-            y, x = top + i * (height + gap), left + j * (width + gap)
+    across, down = (
+        [left + j * (width + gap) for j in range(columns)],
+        [top + i * (height + gap) for i in range(len(rows))],
+    )
+    sheet = np.full((down[-1] + height, across[-1] + width, 3), PAPER, np.uint8)
+    for y, row in zip(down, rows):
+        for x, picture in zip(across, row):
             sheet[y : y + height, x : x + width] = picture
-    for j, label in enumerate(column_labels):
-        x = left + j * (width + gap)
+    for x, label in zip(across, column_labels):
         sheet[:top, x : x + width] = _label(label, width, top, letter)
-    for i, label in enumerate(row_labels):
-        y = top + i * (height + gap)
+    for y, label in zip(down, row_labels):
         sheet[y : y + height, :left] = np.rot90(_label(label, height, left, letter))
     return sheet
 
 
-def color_bar(max_error: float, height: int = 960, colormap: str = "turbo") -> np.ndarray:
+def color_bar(max_error: float, height: int = 960) -> np.ndarray:
     """The scale that belongs to `render_error`: a strip from 0 to ``max_error`` metres, written in millimetres."""
     letter = max(12, height // 32)
     bar = np.full((height, 5 * letter, 3), PAPER, np.uint8)
-    ramp = map_colors(np.linspace(1, 0, height - 3 * letter), colormap)
+    ramp = map_colors(np.linspace(1, 0, height - 3 * letter))
     bar[2 * letter : height - letter, letter : 2 * letter] = np.rint(ramp * 255)[:, None]
     for share in (0, 0.5, 1):
         y = round(2 * letter + (1 - share) * (height - 3 * letter - 1))
@@ -345,8 +275,7 @@ def save_picture(path: str | Path, picture: np.ndarray) -> None:
     kind = PICTURE_FORMATS[check_suffix(path, PICTURE_FORMATS, "a picture")]
     _check_picture("picture", picture)
     encoded = io.BytesIO()
-    image = require("PIL.Image").fromarray(picture)
-    image.save(encoded, format=kind, quality=92)
+    require("PIL.Image").fromarray(picture).save(encoded, format=kind, quality=92)
     write_whole(path, encoded.getvalue())
 
 
@@ -360,9 +289,7 @@ def _label(text: str, width: int, height: int, letter: int) -> np.ndarray:
     """Text in the middle of a strip of paper, smaller where it would not fit."""
     strip = require("PIL.Image").new("RGB", (width, height), PAPER)
     pen = require("PIL.ImageDraw").Draw(strip)
-    font = require("PIL.ImageFont").load_default(letter)
-    taken = pen.textlength(text, font=font)
-    if taken > width:
-        font = require("PIL.ImageFont").load_default(letter * width / taken)
-    pen.text((width / 2, height / 2), text, fill=INK, font=font, anchor="mm")
+    font = require("PIL.ImageFont").load_default
+    taken = pen.textlength(text, font=font(letter))
+    pen.text((width / 2, height / 2), text, fill=INK, font=font(letter * min(1, width / max(taken, 1))), anchor="mm")
     return np.asarray(strip)

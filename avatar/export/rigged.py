@@ -14,7 +14,6 @@ from avatar.geometry.surface import vertex_normals
 from avatar.io.npz import write_whole
 from avatar.records import Motion
 
-FLOAT, UNSIGNED_INT, UNSIGNED_BYTE = 5126, 5125, 5121
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
 INFLUENCES = 4  # in one set of glTF attributes; some viewers read the first set only
 MAX_SETS = 2
@@ -27,16 +26,9 @@ def write_rigged_glb(path: str | Path, body: BodyModel, motion: Motion | None = 
     Skinned from the bind pose as `BodyModel` does, so a viewer shows the vertices `BodyModel` computes; pose
     blendshapes, where a body has them, are left out. The eight largest skinning weights of a vertex are kept, in
     two sets of four where any vertex has more than four. Joint frames are aligned with the world in the T-pose;
-    metres, y up, facing +z, which is also glTF's convention.
-
-    Args:
-        path: ends in .glb.
-        body: at most 256 joints.
-        motion: poses of the body's joints; linear interpolation between frames.
-
-    Raises:
-        AvatarError: when the motion does not fit the body or is not finite, or pygltflib is missing.
-        DataError: for another file name ending.
+    metres, y up, facing +z, which is also glTF's convention. A motion has poses of the body's joints and is linear
+    between frames. Raises `AvatarError` for more than 256 joints, when the motion does not fit the body or is not
+    finite, or without pygltflib; `DataError` for a file name that does not end in .glb.
     """
     path = Path(path)
     check_suffix(path, (".glb",), "a file name")
@@ -64,19 +56,14 @@ class _Buffer:
     def add(self, values: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
         """Appends an array, one row an element, and returns its accessor's index."""
         kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-        components = {"float32": FLOAT, "uint32": UNSIGNED_INT, "uint8": UNSIGNED_BYTE}
+        components = {"float32": 5126, "uint32": 5125, "uint8": 5121}
         rows = np.ascontiguousarray(values).reshape(len(values), -1)
         raw = rows.astype(rows.dtype.newbyteorder("<")).tobytes()
         view = self.gltf.BufferView(buffer=0, byteOffset=len(self.data), byteLength=len(raw), target=target)
         self.data += raw + b"\0" * (-len(raw) % 4)  # accessors begin at multiples of four bytes
-        accessor = self.gltf.Accessor(
-            bufferView=len(self.document.bufferViews),
-            componentType=components[rows.dtype.name],
-            count=len(rows),
-            type=kinds[rows.shape[1]],
-        )
-        if bounds:
-            accessor.min, accessor.max = rows.min(axis=0).tolist(), rows.max(axis=0).tolist()
+        limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()} if bounds else {}
+        place, kind = {"bufferView": len(self.document.bufferViews), "count": len(rows)}, kinds[rows.shape[1]]
+        accessor = self.gltf.Accessor(**place, componentType=components[rows.dtype.name], type=kind, **limits)
         self.document.bufferViews.append(view)
         self.document.accessors.append(accessor)
         return len(self.document.accessors) - 1
@@ -113,18 +100,12 @@ def _add_skeleton(gltf: Any, document: Any, buffer: _Buffer, body: BodyModel) ->
     for joint, parent in enumerate(body.parents):
         offset = joints[joint] - joints[parent] if parent >= 0 else joints[joint]
         children = [child + 1 for child, above in enumerate(body.parents) if above == joint]
-        node = gltf.Node(name=body.joint_names[joint], translation=offset.tolist(), children=children)
-        document.nodes.append(node)
+        document.nodes.append(gltf.Node(name=body.joint_names[joint], translation=offset.tolist(), children=children))
     joint_from_bind = body.zero_from_bind.double().cpu().clone()
     joint_from_bind[:, :3, 3] -= joints
-    columns = joint_from_bind.transpose(1, 2).float().numpy()  # glTF stores matrices column by column
-    skin = gltf.Skin(
-        name="skeleton",
-        inverseBindMatrices=buffer.add(columns),
-        joints=[joint + 1 for joint in range(len(joints))],
-        skeleton=1,
-    )
-    document.skins.append(skin)
+    columns = buffer.add(joint_from_bind.transpose(1, 2).float().numpy())  # glTF stores matrices column by column
+    nodes = [joint + 1 for joint in range(len(joints))]
+    document.skins.append(gltf.Skin(name="skeleton", inverseBindMatrices=columns, joints=nodes, skeleton=1))
     document.scenes.append(gltf.Scene(nodes=[0, 1]))
     document.scene = 0
 

@@ -20,10 +20,9 @@ report = logging.getLogger(__name__)
 def in_chunks(work: Callable[[slice], Part], count: int, size: int) -> list[Part]:
     """What a function gives for consecutive chunks of ``count`` rows, in order; at least one chunk, even of none.
 
-    Chunks have ``size`` rows until memory runs out; from then on half as many. All are multiples of 1024 rows, but for
-    what is left over, which comes last and by itself. For a function that treats every row by itself the joined result
-    is then the same whatever the size: on the CPU to the bit, with a number of threads that is a power of two. Raises
-    `AvatarError` when not even 1024 rows fit.
+    Chunks have ``size`` rows, half as many each time memory runs out. All are multiples of 1024 rows, but for what is
+    left over, which comes last. For a function that treats every row by itself the joined result is then the same to
+    the bit on a power of two threads of the CPU. Raises `AvatarError` when not even 1024 rows fit.
     """
     size, even = max(UNIT, size // UNIT * UNIT), count // UNIT * UNIT
     parts: list[Part] = []

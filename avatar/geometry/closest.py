@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -14,12 +14,8 @@ FIRST_CANDIDATES = 8  # triangles tried for each query before asking whether a f
 CHUNK_PAIRS = 1 << 17  # query-triangle pairs compared at once: what fits a processor's cache is fastest
 
 
-@dataclass(frozen=True)
-class SurfaceHits:
-    """Closest points ``(N, 3)`` on a mesh, their triangles ``face_ids (N,)`` and signed distances ``(N,)``, metres.
-
-    Distances are negative inside (behind the surface, by the pseudo-normal at the closest point).
-    """
+class SurfaceHits(NamedTuple):
+    """Closest points ``(N, 3)`` on a mesh, their triangles and signed distances, ``(N,)``, metres, negative inside."""
 
     points: np.ndarray
     face_ids: np.ndarray
@@ -29,20 +25,11 @@ class SurfaceHits:
 def closest_on_mesh(
     queries: np.ndarray, vertices: np.ndarray, faces: np.ndarray, exact_within: float = np.inf
 ) -> SurfaceHits:
-    """The closest surface point to each query, exactly, and the side of the surface the query is on.
-
-    The sign is that of the angle-weighted pseudo-normal (Baerentzen and Aanaes 2005), which is right for every closed,
-    consistently wound mesh, also where the closest point is an edge or a vertex.
-
-    Args:
-        queries: ``(N, 3)`` metres.
-        vertices: ``(V, 3)`` metres.
-        faces: ``(F, 3)`` counter-clockwise from outside.
-        exact_within: beyond this distance the first triangles tried will do (the distance is then too large, by
-            less than the size of an average triangle); saves most of the time where far points do not matter.
-
-    Raises:
-        AvatarError: on wrong shapes, non-finite coordinates or a mesh without faces.
+    """The closest point of a mesh ``(V, 3)``, ``(F, 3)`` to each query ``(N, 3)``, exactly, and the query's side of it.
+    The sign is that of the angle-weighted pseudo-normal (Baerentzen and Aanaes 2005), which is right for every closed
+    mesh wound counter-clockwise from outside, also at edges and vertices. Beyond ``exact_within`` metres the first
+    triangles tried will do (the distance is then too large, by less than the size of an average triangle); that saves
+    most of the time where far points do not matter.
     """
     check_shape("queries", queries, "N 3")
     check_shape("vertices", vertices, "V 3")
@@ -60,18 +47,15 @@ def closest_on_mesh(
 
 
 def _closest_faces(queries: np.ndarray, vertices: np.ndarray, faces: np.ndarray, exact_within: float) -> np.ndarray:
-    """The closest triangle of each query ``(N,)``: candidates by the distance of their pieces' centres.
-
-    Lists of candidates grow until no piece left out could be closer: its centre is too far away for its size. Long
-    triangles are cut into pieces about as small as the average one, for a single long one would make every search wide.
+    """The closest triangle of each query ``(N,)``: candidates by the distance of their pieces' centres. Lists of
+    candidates grow until no piece left out could be closer: its centre is too far away for its size. Long triangles are
+    cut into pieces about as small as the average one, for a single long one would make every search wide.
     """
     corners = vertices[faces]
     areas = trimesh.triangles.area(corners)
     longest = 1.6 * np.sqrt(areas.mean()) + np.ptp(corners) * 1e-3
-    places, pieces, owners = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=20, return_index=True)
-    centres = places[pieces].mean(axis=1)
-    reach = np.linalg.norm(places[pieces] - centres[:, None], axis=2).max()
-    tree = build_tree(centres)
+    _, owners, centres, reach = cut_triangles(vertices, faces, longest)
+    tree, reach = build_tree(centres), reach.max()
     face_ids, remaining, k = np.empty(len(queries), np.int64), np.arange(len(queries)), FIRST_CANDIDATES
     while len(remaining):
         k, unsure = min(k, tree.n), []
@@ -88,9 +72,15 @@ def _closest_faces(queries: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
     return face_ids
 
 
+def cut_triangles(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, ...]:
+    """Triangles cut into pieces of at most an edge length: corners ``(P, 3, 3)``, faces, centres, reach from them."""
+    places, pieces, owners = trimesh.remesh.subdivide_to_size(vertices, faces, longest, max_iter=20, return_index=True)
+    centres = places[pieces].mean(axis=1)
+    return places[pieces], owners, centres, np.linalg.norm(places[pieces] - centres[:, None], axis=2).max(axis=1)
+
+
 def closest_on_triangles(queries: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The closest point of one triangle to each query. ``(N, 3)`` and ``(N, 3, 3)`` to points and weights, ``(N, 3)``.
-
     Weights are barycentric; those of a point on an edge or at a corner are exactly zero elsewhere.
     """
     squared, weights = _candidates(queries, corners)
@@ -99,9 +89,8 @@ def closest_on_triangles(queries: np.ndarray, corners: np.ndarray) -> tuple[np.n
 
 
 def _candidates(queries: np.ndarray, corners: np.ndarray) -> tuple[list, list]:
-    """Squared distances ``(N,)`` to the closest points inside triangles and on their edges, with barycentric weights.
-
-    A triangle is a + s u + t v, and the squared distance a quadratic in (s, t), from dot products alone. Inside comes
+    """Squared distances ``(N,)`` to the closest points inside triangles and on their edges, with barycentric weights. A
+    triangle is a + s u + t v, and the squared distance a quadratic in (s, t), from dot products alone. Inside comes
     first, infinitely far where the plane's minimum is not inside.
     """
     first, second, away = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], queries - corners[:, 0]

@@ -12,10 +12,7 @@ QUERIES, POINTS = 32, 64  # a tile; 113 registers a thread and no spills on sm_9
 
 @triton.jit
 def search(queries, points, found, n, m, QUERIES: tl.constexpr, POINTS: tl.constexpr):
-    """A program looks for the nearest points of QUERIES queries of one row, POINTS points at a time.
-
-    Every lane keeps the best it has seen; the lanes of a query are compared once, at the end.
-    """
+    """Nearest points of QUERIES queries of one row, POINTS at a time; lanes are compared once, at the end."""
     row = tl.program_id(1).to(tl.int64)
     place = tl.program_id(0) * QUERIES + tl.arange(0, QUERIES)
     asked = place < n

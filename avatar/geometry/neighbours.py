@@ -1,12 +1,11 @@
-"""Exact nearest neighbours: KD-trees on the CPU, brute force on devices. Indices only; distances stay in torch."""
+"""Exact nearest neighbours, by KD-trees on the CPU and brute force on devices, and distances to them, unreduced."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -26,24 +25,25 @@ def nearest(queries: Tensor, points: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def k_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor:
+def k_nearest(queries: Tensor, points: Tensor, k: int, trees: Sequence[Tree] = ()) -> Tensor:
     """Indices of k nearest points to each query, nearest first: ``(B, N, 3)``, ``(B, M, 3)`` to ``(B, N, k)`` int64.
 
-    Exact on every device: distances are sums of squared differences, never the expanded product form, which
-    picks a wrong neighbour for near ties. Among points at the same distance any may come, the same each time.
-
-    Coordinates that are not finite are refused on the CPU. On a device looking for them would stall the stream, so
-    they pass through: the indices stay in range and the distances taken with them are NaN, for the loss to show.
-    Raises `AvatarError` on wrong shapes, non-finite coordinates (CPU), k below 1 or fewer than k points.
+    Exact on every device: distances are sums of squared differences, never the expanded product form. Among points at
+    the same distance any may come, the same each time. ``trees`` are those of the points on the CPU, where they are
+    built already. Raises `AvatarError` on wrong shapes, k below 1, fewer than k points or, on the CPU, coordinates that
+    are not finite; on a device, where a check would stall the stream, their indices stay in range.
     """
-    dims = check_shape("queries", queries, "B N 3")
-    dims = check_shape("points", points, "B M 3", B=dims["B"])
+    dims = check_shape("points", points, "B M 3", B=check_shape("queries", queries, "B N 3")["B"])
     if not 1 <= k <= dims["M"]:
-        raise AvatarError(f"k, points: expected k of at least 1 and k={k} points or more, got {dims['M']} points.")
-    if queries.device.type != "cpu":
-        return _k_nearest_on_device(queries, points, k)
-    pairs = zip(queries.double().numpy(), points.double().numpy())
-    return torch.stack([_query(build_tree(cloud), query, k) for query, cloud in pairs])
+        raise AvatarError(f"k, points: expected k of 1 to the {dims['M']} points, got {k}.")
+    if queries.device.type == "cpu":
+        trees = trees or [build_tree(cloud) for cloud in points.double().numpy()]
+        return torch.stack([_query(tree, query, k) for tree, query in zip(trees, queries.double().numpy())])
+    if k == 1 and queries.is_cuda and torch.float64 not in (queries.dtype, points.dtype):
+        found = try_fused(queries.float(), points.float())
+        if found is not None:
+            return found.unsqueeze(-1)
+    return torch.stack([_k_nearest_chunked(q, p, k) for q, p in zip(queries, points)])
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,8 @@ class Correspondences:
 def correspond(points: Tensor, scan: Tensor) -> Correspondences:
     """What `nearest` gives for points ``(B, N, 3)`` in a scan ``(B, M, 3)`` and the other way, faster on the CPU.
 
-    A tree keeps its points in an order in which neighbours follow each other; queried in that order, the other tree's
-    branches stay in the processor's cache. Trees are built side by side, each cloud by one thread. Among points at the
-    same distance another may come than from `nearest`. Raises `AvatarError` as `k_nearest`.
+    Points are queried in the order of their own tree, so the other tree's branches stay in the processor's cache. Among
+    points at the same distance another may come than from `nearest`. Raises `AvatarError` as `k_nearest`.
     """
     dims = check_shape("points", points, "B N 3")
     check_shape("scan", scan, "B M 3", B=dims["B"])
@@ -78,69 +77,36 @@ class FixedPoints:
 
     def __init__(self, points: Tensor):
         check_shape("points", points, "M 3")
-        self.points = points.detach()
+        self.points, self.trees = points.detach(), []
 
-    @cached_property
-    def _tree(self) -> Tree:
-        return build_tree(self.points.double().cpu().numpy())
-
-    @torch.no_grad()
     def k_nearest(self, queries: Tensor, k: int) -> Tensor:
-        """Indices ``(..., k)`` int64 of the k nearest points to queries ``(..., 3)`` on any device, nearest first.
-
-        Raises `AvatarError` as `avatar.geometry.neighbours.k_nearest`.
-        """
+        """Indices ``(..., k)`` of the k nearest points to queries ``(..., 3)`` on any device; as `k_nearest`."""
         check_shape("queries", queries, "... 3")
-        if not 1 <= k <= len(self.points):
-            raise AvatarError(f"k, points: expected k of 1 to the {len(self.points)} points, got {k}.")
-        flat = queries.reshape(-1, 3)
-        if queries.device.type == "cpu":
-            found = _query(self._tree, flat.double().numpy(), k)
-        else:
-            self.points = self.points.to(queries.device)
-            found = _k_nearest_on_device(flat[None], self.points[None], k)[0]
+        self.points = self.points.to(queries.device)
+        if queries.device.type == "cpu" and not self.trees:
+            self.trees = [build_tree(self.points.double().numpy())]
+        found = k_nearest(queries.reshape(1, -1, 3), self.points[None], k, self.trees)[0]
         return found.unflatten(0, queries.shape[:-1])
 
 
-def _k_nearest_on_device(queries: Tensor, points: Tensor, k: int) -> Tensor:
-    """`k_nearest` away from the CPU: in one pass where Triton can, else by brute force."""
-    if k == 1 and queries.is_cuda and torch.float64 not in (queries.dtype, points.dtype):
-        found = try_fused(queries.float(), points.float())
-        if found is not None:
-            return found.unsqueeze(-1)
-    return torch.stack([_k_nearest_chunked(q, p, k) for q, p in zip(queries, points)])
-
-
 def try_fused(queries: Tensor, points: Tensor) -> Tensor | None:
-    """`kernels.nearest_fused`; None, with one warning for each kind of error, where Triton fails.
+    """`kernels.nearest_fused`; None, with one warning for each kind of error, where Triton is missing or fails.
 
-    CUDA builds of torch include Triton, but it needs a C compiler, too. What fails once, such as for want of memory, is
-    tried again at the next call.
+    It needs a C compiler, too. What fails once, such as for want of memory, is tried again at the next call; a package
+    that is not there is not looked for again.
     """
-    search = fused_search()
-    try:
-        return search and search(queries, points)
-    except Exception as error:  # whatever a compiler or a driver says: it is only slower without
-        warn_slow(type(error).__name__, str(error))
+    if WARNED & {"ImportError", "ModuleNotFoundError"}:
         return None
-
-
-@cache
-def fused_search() -> Callable[[Tensor, Tensor], Tensor] | None:
-    """`kernels.nearest_fused`; None, with a warning, where there is no Triton."""
     try:
         from avatar.geometry.kernels import nearest_fused
-    except ImportError as error:
-        warn_slow(type(error).__name__, str(error))
+
+        return nearest_fused(queries, points)
+    except Exception as error:  # whatever a compiler or a driver says: it is only slower without
+        kind, text = type(error).__name__, "Nearest neighbours on CUDA go the slow way, for Triton failed (%s: %s)."
+        if kind not in WARNED:
+            WARNED.add(kind)
+            report.warning(text, kind, error)
         return None
-    return nearest_fused
-
-
-def warn_slow(kind: str, reason: str) -> None:
-    """Warns that a search goes by brute force: once for each kind of error."""
-    if kind not in WARNED:
-        WARNED.add(kind)
-        report.warning("Nearest neighbours on CUDA go the slow way, for Triton failed (%s: %s).", kind, reason)
 
 
 def _query(tree: Tree, queries: np.ndarray, k: int) -> Tensor:
@@ -171,16 +137,57 @@ def _k_nearest_chunked(queries: Tensor, points: Tensor, k: int) -> Tensor:
     return torch.cat(found)
 
 
-def ball_query(centres: Tensor, points: Tensor, radius: float, k: int) -> Tensor:
-    """Up to k nearest points within a radius of each centre; short lists repeat their nearest point.
+def ball_query(centres: Tensor, points: Tensor, radius: float, k: int, ranks: Tensor | None = None) -> Tensor:
+    """Up to k points within a radius of each centre, its nearest first; short lists repeat their nearest point.
 
+    Of a ball that holds more, the nearest to its centre or, with ``ranks (N,)``, those of lowest rank beside the very
+    nearest: ranks in the order of farthest-point sampling spread them over the ball, whatever the density of points.
     For a constant template, called once (CloSET 4, network architecture). ``(S, 3)`` and ``(N, 3)``, metres, to
     ``(S, k)`` int64. A centre with no point in reach gets its nearest point k times.
     """
     check_shape("centres", centres, "S 3")
     check_shape("points", points, "N 3")
+    if ranks is not None:
+        return _ranked_ball_query(centres, points, radius, k, ranks)
     reach = min(k, len(points))
     ids = k_nearest(centres[None], points[None], reach)[0]
     distances = (points[ids] - centres[:, None]).norm(dim=-1)
     ids = torch.where(distances <= radius, ids, ids[:, :1])
     return torch.cat([ids, ids[:, :1].expand(-1, k - reach)], dim=1)
+
+
+def _ranked_ball_query(centres: Tensor, points: Tensor, radius: float, k: int, ranks: Tensor) -> Tensor:
+    groups, order = nearest(centres[None], points[None])[0, :, None].expand(-1, k).cpu().numpy().copy(), ranks.cpu()
+    tree = build_tree(points.double().cpu().numpy())
+    balls = tree.query_ball_point(centres.double().cpu().numpy(), radius, return_sorted=False)
+    for group, ball in zip(groups, balls):
+        others = np.setdiff1d(np.asarray(ball, np.int64), group[:1], assume_unique=True)
+        kept = others[order.numpy()[others].argsort()[: k - 1]]
+        group[1 : 1 + len(kept)] = kept
+    return torch.from_numpy(groups).to(points.device)
+
+
+def point_to_point(points: Tensor, anchors: Tensor) -> Tensor:
+    """Squared distance of each point to its anchor (CloSET eq. 4). ``(B, N, 3)`` twice to ``(B, N)``, m^2."""
+    dims = check_shape("points", points, "B N 3")
+    check_shape("anchors", anchors, "B N 3", **dims)
+    return (points - anchors).square().sum(dim=-1)
+
+
+def point_to_plane(points: Tensor, anchors: Tensor, normals: Tensor) -> Tensor:
+    """Squared distance of each point to the tangent plane at its anchor. ``(B, N, 3)`` thrice to ``(B, N)``, m^2.
+
+    With nearest scan points as anchors this approximates squared point-to-surface distance and does not penalise
+    sliding along the cloth (POP's prediction-to-scan term).
+    """
+    dims = check_shape("points", points, "B N 3")
+    check_shape("anchors", anchors, "B N 3", **dims)
+    check_shape("normals", normals, "B N 3", **dims)
+    return ((points - anchors) * normals).sum(dim=-1).square()
+
+
+def normal_difference(normals: Tensor, anchor_normals: Tensor) -> Tensor:
+    """L1 distance between unit normals (CloSET eq. 5). ``(B, N, 3)`` twice to ``(B, N)``, in [0, 2 sqrt 3]."""
+    dims = check_shape("normals", normals, "B N 3")
+    check_shape("anchor_normals", anchor_normals, "B N 3", **dims)
+    return (normals - anchor_normals).abs().sum(dim=-1)

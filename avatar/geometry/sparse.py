@@ -1,8 +1,7 @@
 """Sparse weighted gathers from the rows of a mesh or a hierarchy, and their transposes, which scatter back.
 
-Autograd's own backward pass of a gather adds row by row: slowly on the CPU, where the order may depend on threads, and
-by atomic additions on CUDA, in another order each time. The transpose of a table is a table again, so both directions
-are the same fast, repeatable sum.
+Autograd's own backward pass of a gather adds slowly on the CPU and in an order of chance on CUDA. The transpose of a
+table is a table again, so both directions are the same fast, repeatable sum.
 """
 
 from __future__ import annotations
@@ -19,10 +18,9 @@ from avatar.checks import check_shape
 
 @dataclass(frozen=True)
 class SparseRows:
-    """A sparse linear map on rows: result ``i`` adds up ``weights[j] * values[ids[j]]`` for j from ``starts[i]`` on.
+    """A sparse linear map on ``rows`` rows: result ``i`` adds up ``weights[j] * values[ids[j]]`` from ``starts[i]`` on.
 
-    ``ids (L,)`` int64, ``starts (R,)`` int64, one sum after the other, ``weights (L,)`` or None where all are one;
-    ``rows`` is the number of rows of the values.
+    ``ids (L,)`` int64, ``starts (R,)`` int64, one sum after the other, ``weights (L,)`` or None where all are one.
     """
 
     ids: Tensor

@@ -35,9 +35,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 def sample_surface(vertices: Tensor, faces: Tensor, count: int, generator: torch.Generator) -> SurfaceSamples:
     """Points on a surface ``(V, 3)``, ``(F, 3)`` with uniform expected density, without any UV map.
 
-    Stratified over the cumulative area: every part of the surface gets its share of points to within one, so they are
-    more even than independent draws. The same state of the CPU's ``generator`` gives the same samples. Raises
-    `AvatarError` when the surface has no area or ``count`` is not positive.
+    Stratified over the cumulative area: every part of the surface gets its share of points to within one. The state of
+    the CPU's ``generator`` fixes them. Raises `AvatarError` for a surface without area or a count below 1.
     """
     check_shape("vertices", vertices, "V 3")
     if count < 1:
@@ -58,10 +57,7 @@ def sample_surface(vertices: Tensor, faces: Tensor, count: int, generator: torch
 
 
 def interpolate(values: Tensor, samples: SurfaceSamples) -> Tensor:
-    """Barycentric interpolation of per-vertex values (CloSET eq. 2). ``(..., V, C)`` to ``(..., N, C)``.
-
-    Weighted sums of three rows: differentiable, and no ``(N, 3, C)`` array is ever made.
-    """
+    """Barycentric interpolation of per-vertex values (CloSET eq. 2). ``(..., V, C)`` to ``(..., N, C)``."""
     check_shape("values", values, "... V C")
     sparse = SparseRows.of_table(samples.vertex_ids, values.shape[-2], samples.barycentric)
     return gather_sum(values, sparse)
@@ -76,9 +72,8 @@ def interpolate_transforms(transforms: Tensor, samples: SurfaceSamples) -> Tenso
 def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
     """Indices ``(count,)`` of a subset of points ``(N, 3)``, each the farthest from all before it (PointNet++).
 
-    The first is ``start``, so the same points give the same subset. No index comes twice, not even where points
-    coincide. O(N count): call it once on a constant template. Raises `AvatarError` for a count or start out of range,
-    or coordinates that are not finite.
+    The first is ``start``. No index comes twice, not even where points coincide. O(N count): call it once on a constant
+    template. Raises `AvatarError` for a count or start out of range, or coordinates that are not finite.
     """
     dims = check_shape("points", points, "N 3")
     if not 1 <= count <= dims["N"]:

@@ -1,4 +1,4 @@
-"""Rigid and affine transforms as (..., 4, 4) matrices, named destination_from_source.
+"""Rigid and affine transforms as (..., 4, 4) matrices, named destination_from_source; Fourier features of points.
 
 RoMa is imported where it is used: it loads torch's compiler, which takes as long as torch itself.
 """
@@ -30,10 +30,9 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def relative_quaternions(joint_transforms: Tensor, parents: Sequence[int]) -> Tensor:
-    """Rotations of all joints but the root against their parents, as unit quaternions (x, y, z, w), w at least 0.
+    """Rotations of joints but the root against their parents, unit quaternions ``(B, J - 1, 4)`` as x, y, z, w >= 0.
 
-    ``(B, J, 4, 4)`` posed_from_canonical and J parents, -1 for the root, to ``(B, J - 1, 4)``. Needs no pose parameters
-    and does not change with the body's place and heading.
+    From ``(B, J, 4, 4)`` posed_from_canonical and J parents, so they do not change with the body's place and heading.
     """
     import roma
 
@@ -75,11 +74,10 @@ def invert_affine(transforms: Tensor) -> Tensor:
 
 
 def rotation_between(source: Tensor, target: Tensor) -> Tensor:
-    """The smallest rotation that turns one direction onto another. ``(3,)`` each, to ``(3, 3)``.
+    """The smallest rotation that turns one direction ``(3,)`` onto another, ``(3, 3)``; worked out in float64.
 
-    Opposite directions have many such half turns: the one about a perpendicular nearest a coordinate axis is given.
-    Worked out in float64, so that directions a hair from parallel keep their axis. Raises `AvatarError` for a direction
-    of no length.
+    Of the half turns between opposite directions, that about a perpendicular nearest a coordinate axis. Raises
+    `AvatarError` for a direction of no length.
     """
     check_shape("source", source, "3")
     check_shape("target", target, "3")
@@ -93,3 +91,12 @@ def rotation_between(source: Tensor, target: Tensor) -> Tensor:
     if axis.norm() < 1e-8:  # (anti)parallel: the cross product no longer tells the axis
         axis = torch.linalg.cross(source, torch.eye(3, dtype=source.dtype, device=source.device)[source.abs().argmin()])
     return rotation_from_axis_angle(axis / axis.norm() * angle).to(dtype)
+
+
+def fourier_features(points: Tensor, orders: int, base: float = 1.0) -> Tensor:
+    """Points ``(..., 3)``, then sin and cos of ``base`` 2^k of them for k below ``orders``, to ``(..., 3 + 6 orders)``.
+
+    The base is pi in NeRF and 1 in SCANimate.
+    """
+    waves = [wave(base * 2**order * points) for order in range(orders) for wave in (torch.sin, torch.cos)]
+    return torch.cat([points, *waves], dim=-1)

@@ -14,11 +14,10 @@ LEAF = 32  # points in a leaf; on surfaces a little faster than scipy's 10 or 16
 def build_tree(points: np.ndarray) -> Tree:
     """A KD-tree of points ``(M, D)`` of any float type, none included, split at the midpoints of its cells.
 
-    Every command has the processor take denormal numbers for zero (`environment.prepared_process`). scipy's default
-    tree then recurses until the stack overflows wherever the median of an axis is its minimum and that is 0, for it
-    splits at ``nextafter(0)``, which is 0 again; so do midpoint splits of the points' own bounds below 5e-308. With
-    ``compact_nodes=False`` scipy tries another axis where a split leaves one side without points, so building ends for
-    all coordinates. It also builds and answers faster. Raises `AvatarError` when a coordinate is not finite.
+    Where denormal numbers count as zero, as in every command (`environment.prepared_process`), scipy's default tree
+    recurses until the stack overflows if the median of an axis is its minimum, 0; so do midpoint splits of the points'
+    own bounds below 5e-308. With ``compact_nodes=False`` another axis is tried, so building ends for all coordinates;
+    it is also faster. Raises `AvatarError` when a coordinate is not finite.
     """
     try:
         return cKDTree(points, leafsize=LEAF, balanced_tree=False, compact_nodes=False)

@@ -16,9 +16,9 @@ INSIDE = 1e-12  # how far below zero rounding may take a barycentric coordinate 
 
 @dataclass(frozen=True)
 class UVGrid:
-    """The pixels of a square image whose centres lie in the atlas, and the surface points under them.
+    """Pixels ``(N,)`` of a square image of ``size`` a side whose centres lie in the atlas, and the N points under them.
 
-    ``size`` pixels a side; ``pixels (N,)`` row-major and rising, row 0 at v = 0; ``samples`` of N points.
+    Pixels are row-major and rising, row 0 at v = 0.
     """
 
     size: int
@@ -27,27 +27,22 @@ class UVGrid:
 
 
 def check_atlas(uv: Tensor, uv_faces: Tensor, faces: int) -> None:
-    """Refuses UV coordinates ``(U, 2)`` and corner indices ``(F, 3)`` that do not belong together.
-
-    Raises `AvatarError` naming what is missing, of another shape, not finite or out of range.
-    """
+    """Raises `AvatarError` for UV coordinates ``(U, 2)`` and corner indices ``(F, 3)`` that do not belong together."""
     check_shape("uv", uv, "U 2")
     check_shape("uv_faces", uv_faces, "F 3", F=faces)
     check_finite("uv", uv)
     if faces and not 0 <= int(uv_faces.min()) <= int(uv_faces.max()) < len(uv):
-        raise AvatarError(
-            f"uv_faces: expected indices in [0, {len(uv)}), got {int(uv_faces.min())} to {int(uv_faces.max())}."
-        )
+        got = f"{int(uv_faces.min())} to {int(uv_faces.max())}"
+        raise AvatarError(f"uv_faces: expected indices in [0, {len(uv)}), got {got}.")
 
 
 def rasterise_uv(uv: Tensor, uv_faces: Tensor, faces: Tensor, size: int) -> UVGrid:
     """The surface point under the centre of each pixel of an atlas.
 
-    Pixel (row, column) has its centre at ``u = (column + 1/2) / size``, ``v = (row + 1/2) / size``, which is also
-    where ``grid_sample`` with ``align_corners=False`` places it. It belongs to the triangle that holds its centre,
-    borders included; to that with the lowest index where there are several. ``uv (U, 2)`` are in [0, 1], ``uv_faces``
-    and ``faces (F, 3)`` a triangle's corners in the atlas and on the surface. Raises `AvatarError` for coordinates out
-    of [0, 1], a size below 1, or an atlas that covers no pixel.
+    Pixel (row, column) has its centre at ``u = (column + 1/2) / size``, ``v = (row + 1/2) / size`` and belongs to the
+    triangle that holds it, borders included, of several to that with the lowest index. ``uv (U, 2)`` are in [0, 1],
+    ``uv_faces`` and ``faces (F, 3)`` a triangle's corners in the atlas and on the surface. Raises `AvatarError` for
+    coordinates out of [0, 1], a size below 1, or an atlas that covers no pixel.
     """
     check_atlas(uv, uv_faces, check_shape("faces", faces, "F 3")["F"])
     if size < 1:
@@ -64,8 +59,7 @@ def rasterise_uv(uv: Tensor, uv_faces: Tensor, faces: Tensor, size: int) -> UVGr
     pixels, order = pixels[owned].sort()
     if not len(pixels):
         raise AvatarError(f"uv: expected an atlas that covers pixels of a {size} x {size} image, got one without any.")
-    face_ids = face_ids[owned][order]
-    barycentric = barycentric[owned][order].clamp(min=0)
+    face_ids, barycentric = face_ids[owned][order], barycentric[owned][order].clamp(min=0)
     barycentric = (barycentric / barycentric.sum(dim=-1, keepdim=True)).to(uv.dtype)
     samples = SurfaceSamples(faces.cpu()[face_ids], barycentric, face_ids)
     return UVGrid(size, pixels.to(uv.device), samples.to(uv.device))

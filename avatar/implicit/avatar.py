@@ -10,13 +10,13 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from avatar.body.skinning import skin_transforms
-from avatar.checks import AvatarError, check_shape
+from avatar.checks import AvatarError, check_range, check_shape
 from avatar.geometry.chunks import in_chunks
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import transform_points
+from avatar.implicit import networks
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
-from avatar.implicit.fields import Attention, FieldLattice, PoseGate, joint_quaternions
-from avatar.implicit.networks import MlpConfig, PosedSdf, SdfConfig, TextureField
+from avatar.implicit.networks import Attention, MlpConfig, SdfConfig
 from avatar.records import Mesh, PointCloud, Template
 
 CHUNK = 65_536  # points skinned or coloured at once
@@ -44,8 +44,7 @@ class ImplicitConfig:
     gate_spacing: float = 0.0  # metres between nodes at which skinning weights are read for the gates; 0 reads none
 
     def __post_init__(self):
-        if self.rings < 0 or self.gate_spacing < 0:
-            raise AvatarError(f"rings, gate_spacing: expected at least 0, got {self.rings} and {self.gate_spacing}.")
+        check_range(self, "rings", "gate_spacing", low=0)
 
 
 class ImplicitAvatar(nn.Module):
@@ -55,25 +54,21 @@ class ImplicitAvatar(nn.Module):
     """
 
     def __init__(self, template: Template, field: nn.Module, box: Tensor, config: ImplicitConfig):
-        """Builds an untrained avatar.
+        """Builds an untrained avatar on the body at rest; ``field`` gives ``(B, N, J)`` weights of canonical points.
 
-        Args:
-            template: the body at rest in canonical space.
-            field: forward skinning field, ``(B, N, 3)`` canonical points to ``(B, N, J)`` weights.
-            box: ``(2, 3)`` lowest and highest corner of canonical space that clothes can reach, metres.
-            config: switches and sizes.
+        The ``box (2, 3)`` has the corners of canonical space that clothes can reach, metres.
         """
         super().__init__()
         self.config, self.parents = config, tuple(template.parents)
         self.field = field.eval().requires_grad_(False)
         self.register_buffer("box", box.detach().clone(), persistent=False)
         self.register_buffer("canonical_from_bind", template.canonical_from_bind, persistent=False)
-        self.gate = PoseGate(self.parents, config.rings, config.attention, config.normalised)
+        self.gate = networks.PoseGate(self.parents, config.rings, config.attention, config.normalised)
         lattice = config.pose is PoseInput.local and config.gate_spacing
-        self.near_field = FieldLattice(self.field, self.box, config.gate_spacing) if lattice else None
-        self.sdf = PosedSdf(0 if config.pose is PoseInput.none else self.gate.channels, self.box, config.sdf)
+        self.near_field = networks.FieldLattice(self.field, self.box, config.gate_spacing) if lattice else None
+        self.sdf = networks.PosedSdf(0 if config.pose is PoseInput.none else self.gate.channels, self.box, config.sdf)
         inputs = self.sdf.mlp.layers[0].in_features
-        self.texture = TextureField(inputs, self.sdf.mlp.channels, config.texture) if config.colored else None
+        self.texture = networks.TextureField(inputs, self.sdf.mlp.channels, config.texture) if config.colored else None
 
     def pose_features(self, points: Tensor, joint_transforms: Tensor) -> Tensor:
         """Pose features ``(B, N, P)`` of each point; see `PoseInput`."""
@@ -81,19 +76,14 @@ class ImplicitAvatar(nn.Module):
         if self.config.pose is PoseInput.none:
             return points.new_zeros(*points.shape[:2], 0)
         if self.config.pose is PoseInput.global_:
-            quaternions = joint_quaternions(joint_transforms, self.parents).flatten(1)
+            quaternions = networks.joint_quaternions(joint_transforms, self.parents).flatten(1)
             return quaternions[:, None].expand(-1, dims["N"], -1)
         return self.gate((self.near_field or self.field)(points), joint_transforms)
 
     def forward(self, points: Tensor, joint_transforms: Tensor) -> Tensor:
-        """Signed distance in canonical space to the surface of a pose.
+        """Signed distances ``(B, N)`` of canonical points ``(B, N, 3)``, metres, negative inside.
 
-        Args:
-            points: ``(B, N, 3)`` canonical points, metres.
-            joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical; global motion in them changes nothing.
-
-        Returns:
-            ``(B, N)`` metres, negative inside.
+        ``joint_transforms (B, J, 4, 4)`` are posed_from_canonical; global motion in them changes nothing.
         """
         return self.sdf(points, self.pose_features(points, joint_transforms))
 
@@ -111,15 +101,10 @@ class ImplicitAvatar(nn.Module):
 
     @torch.no_grad()
     def canonical_mesh(self, joint_transforms: Tensor, config: ExtractionConfig | None = None) -> Mesh:
-        """The surface of a pose in canonical space, coloured where the avatar is.
-
-        Args:
-            joint_transforms: ``(J, 4, 4)`` posed_from_canonical.
-            config: resolution of marching cubes.
-        """
+        """The surface of a pose ``(J, 4, 4)``, posed_from_canonical, in canonical space; with the colours there are."""
         check_shape("joint_transforms", joint_transforms, "J 4 4", J=len(self.parents))
         pose = joint_transforms[None].to(self.box)
-        mesh = extract_surface(lambda points: self(points[None], pose)[0], self.box, config).mesh
+        mesh = extract_surface(lambda points: self(points[None], pose)[0], self.box, config)
         if self.texture is None:
             return mesh
         vertices = torch.from_numpy(mesh.vertices).to(self.box)
@@ -128,11 +113,9 @@ class ImplicitAvatar(nn.Module):
 
     @torch.no_grad()
     def pose_mesh(self, mesh: Mesh, joint_transforms: Tensor) -> Mesh:
-        """A canonical mesh posed by forward LBS with the field's weights, global motion included.
+        """A mesh in canonical space posed by forward LBS with the field's weights, global motion included.
 
-        Args:
-            mesh: of `canonical_mesh`, or any other in canonical space.
-            joint_transforms: ``(J, 4, 4)`` posed_from_canonical.
+        ``joint_transforms (J, 4, 4)`` are posed_from_canonical.
         """
         vertices = torch.from_numpy(mesh.vertices).to(self.box)
         pose = joint_transforms[None].to(self.box)
@@ -142,16 +125,6 @@ class ImplicitAvatar(nn.Module):
             return transform_points(transforms, vertices[chunk][None])[0]
 
         return replace(mesh, vertices=torch.cat(in_chunks(pose_chunk, len(vertices), CHUNK)).cpu().numpy())
-
-    def posed_mesh(self, joint_transforms: Tensor, config: ExtractionConfig | None = None) -> Mesh:
-        """The dressed person in a pose, ``(J, 4, 4)`` posed_from_canonical: extracted, then posed."""
-        return self.pose_mesh(self.canonical_mesh(joint_transforms, config), joint_transforms)
-
-    def sample(
-        self, joint_transforms: Tensor, count: int, seed: int = 0, config: ExtractionConfig | None = None
-    ) -> PointCloud:
-        """The dressed person in a pose as oriented points, spread evenly over the posed surface."""
-        return sample_mesh(self.posed_mesh(joint_transforms, config), count, seed)
 
 
 def sample_mesh(mesh: Mesh, count: int, seed: int = 0) -> PointCloud:

@@ -12,7 +12,7 @@ import scipy.sparse as sparse
 import torch
 from torch import Tensor
 
-from avatar.checks import AvatarError, check_finite, check_shape, require
+from avatar.checks import AvatarError, check_finite, check_range, check_shape, require
 from avatar.geometry.chunks import in_chunks
 from avatar.records import Mesh
 
@@ -33,37 +33,19 @@ class ExtractionConfig:
     parts: int = 1  # connected parts kept, those of largest area; 0 keeps all
 
     def __post_init__(self):
-        if not 4 <= self.coarsest <= self.resolution <= 2048:
-            raise AvatarError(
-                "resolution, coarsest: expected 4 <= coarsest <= resolution <= 2048, "
-                f"got {self.coarsest} and {self.resolution}."
-            )
-        if self.lipschitz <= 0 or self.parts < 0:
-            raise AvatarError(f"lipschitz, parts: expected above 0 and at least 0, got {self.lipschitz}, {self.parts}.")
+        check_range(self, "resolution", low=4, high=2048)
+        if not 4 <= self.coarsest <= self.resolution:
+            raise AvatarError(f"coarsest: expected 4 to resolution={self.resolution}, got {self.coarsest}.")
+        check_range(self, "lipschitz", above=0)
+        check_range(self, "parts", low=0)
 
 
-@dataclass(frozen=True)
-class Extracted:
-    """A surface and what it took: ``evaluations`` of the field, of ``nodes`` that a dense grid would have asked."""
-
-    mesh: Mesh
-    evaluations: int
-    nodes: int
-
-
-def extract_surface(
-    field: Callable[[Tensor], Tensor], box: Tensor, config: ExtractionConfig | None = None
-) -> Extracted:
+def extract_surface(field: Callable[[Tensor], Tensor], box: Tensor, config: ExtractionConfig | None = None) -> Mesh:
     """The surface where a signed distance is zero, wound so that normals point to positive values.
 
     Marching cubes on values that are exact in every cell that can hold the surface; the mesh is that of a dense
-    grid as long as the field is nowhere steeper than ``lipschitz``.
-
-    Args:
-        field: ``(N, 3)`` points to ``(N,)`` distances, metres; negative inside.
-        box: ``(2, 3)`` lowest and highest corner of the space to look in.
-        config: resolution and what is kept.
-
+    grid as long as the field is nowhere steeper than ``lipschitz``. The field takes ``(N, 3)`` points to ``(N,)``
+    distances, metres, negative inside; ``box (2, 3)`` are the lowest and highest corner of the space to look in.
     Raises `AvatarError` when the field has no zero in the box, or is not finite.
     """
     check_shape("box", box, "2 3")
@@ -77,12 +59,12 @@ def extract_surface(
     values = np.zeros(shape, np.float32)
     wanted = np.ones(shape, bool)
     near = np.ones(tuple(n - 1 for n in shape), bool)
-    evaluations = _evaluate(field, low, coarse, values, wanted)
+    _evaluate(field, low, coarse, values, wanted)
     for level in range(levels):
         near &= _may_hold_zero(values, config.lipschitz * coarse / 2**level)
         values, wanted = _refine(values), _nodes_within(near)
         near = near.repeat(2, 0).repeat(2, 1).repeat(2, 2)
-        evaluations += _evaluate(field, low, coarse / 2 ** (level + 1), values, wanted)
+        _evaluate(field, low, coarse / 2 ** (level + 1), values, wanted)
     if not values.min() < 0 < values.max():
         raise AvatarError(
             f"field: expected a zero between {low.tolist()} and {high.tolist()}, its values there reach from "
@@ -91,27 +73,20 @@ def extract_surface(
     march = require("skimage.measure").marching_cubes
     vertices, faces, _, _ = march(values, 0.0, gradient_direction="descent")
     vertices = (vertices * step + low.cpu().numpy()).astype(np.float32)
-    mesh = largest_parts(Mesh(vertices, faces.astype(np.int64)), config.parts)
-    return Extracted(mesh, evaluations, values.size)
+    return largest_parts(Mesh(vertices, faces.astype(np.int64)), config.parts)
 
 
 @torch.no_grad()
 def _evaluate(
     field: Callable[[Tensor], Tensor], low: Tensor, step: float, values: np.ndarray, wanted: np.ndarray
-) -> int:
-    """Puts the field's values at the wanted nodes; gives how many they were."""
-    ids = np.argwhere(wanted)
-    if not len(ids):
-        return 0
-    nodes = torch.from_numpy(ids).to(low.device)
-
-    def ask(chunk: slice) -> Tensor:
-        return field(low + step * nodes[chunk].to(low.dtype)).float().cpu()
-
-    joined = torch.cat(in_chunks(ask, len(ids), CHUNK))
-    check_finite("field", joined)
-    values[wanted] = joined.numpy()
-    return len(ids)
+) -> None:
+    """Puts the field's values at the wanted nodes."""
+    nodes = torch.from_numpy(np.argwhere(wanted)).to(low.device)
+    if len(nodes):
+        parts = in_chunks(lambda part: field(low + step * nodes[part].to(low.dtype)).float().cpu(), len(nodes), CHUNK)
+        joined = torch.cat(parts)
+        check_finite("field", joined)
+        values[wanted] = joined.numpy()
 
 
 def _may_hold_zero(values: np.ndarray, slope: float) -> np.ndarray:

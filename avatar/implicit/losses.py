@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avatar.checks import AvatarError, check_shape
+from avatar.checks import check_range, check_shape
 from avatar.implicit.avatar import ImplicitAvatar
 from avatar.records import LossTerms
 
@@ -27,9 +27,7 @@ class ImplicitLossConfig:
     sharpness: float = 100.0  # alpha of eq. 17, 1/metre
 
     def __post_init__(self):
-        wrong = {key: value for key, value in vars(self).items() if value < 0}
-        if wrong:
-            raise AvatarError(f"loss: expected weights of at least 0, got {wrong}.")
+        check_range(self, *vars(self), low=0)
 
 
 @dataclass(frozen=True)
@@ -51,16 +49,9 @@ class FieldValues:
 def implicit_loss(
     values: FieldValues, normals: Tensor, config: ImplicitLossConfig, colors: Tensor | None = None
 ) -> LossTerms:
-    """The training loss of the implicit avatar (SCANimate eqs. 14-17), every term named.
+    """The training loss of the implicit avatar (SCANimate eqs. 14-17), means over points and frames, every term named.
 
-    Args:
-        values: the field at the step's points.
-        normals: ``(B, S, 3)`` unit normals of the scan.
-        config: weights.
-        colors: ``(B, S, 3)`` of the scan in [0, 1], where a texture is learned.
-
-    Returns:
-        `LossTerms` reduced to means over points and frames.
+    ``normals (B, S, 3)`` are the scan's, unit; ``colors (B, S, 3)`` in [0, 1], where a texture is learned.
     """
     dims = check_shape("surface", values.surface, "B S")
     check_shape("normals", normals, "B S 3", **dims)
@@ -86,15 +77,11 @@ class QueryConfig:
     near_points: int = 10_000  # half about the scan, half about the body
     near_distance: float = 0.1  # metres, standard deviation of each coordinate
     box_points: int = 2000  # anywhere in the box
-    rim_points: int = 500  # on the sides of the box
+    boundary_points: int = 500  # on the sides of the box
 
     def __post_init__(self):
-        counts = {name: getattr(self, name) for name in ("near_points", "box_points", "rim_points")}
-        if min(counts.values()) < 1 or self.near_distance <= 0:
-            raise AvatarError(
-                f"near_points, box_points, rim_points: expected at least 1, near_distance: above 0 m; "
-                f"got {counts} and {self.near_distance}."
-            )
+        check_range(self, "near_points", "box_points", "boundary_points", low=1)
+        check_range(self, "near_distance", above=0)
 
 
 @dataclass(frozen=True)
@@ -111,10 +98,8 @@ def sample_queries(
 ) -> QueryPoints:
     """Query points of a step: Gaussian about scan and body, uniform in the box and on its boundary.
 
-    Args:
-        scan: ``(B, S, 3)`` canonical scan points; body: ``(V, 3)`` canonical body; box: ``(2, 3)``; on one device.
-        config: counts and distance.
-        generator: CPU random state; the same state draws the same points.
+    Of canonical ``scan (B, S, 3)``, ``body (V, 3)`` and ``box (2, 3)`` on one device. The same state of the CPU's
+    ``generator`` draws the same points.
     """
     dims = check_shape("scan", scan, "B S 3")
     check_shape("body", body, "V 3")
@@ -129,22 +114,16 @@ def sample_queries(
     anchors = torch.cat([scan.gather(1, of_scan[..., None].expand(-1, -1, 3)), body[of_body]], dim=1)
     near = anchors + config.near_distance * torch.randn(anchors.shape, generator=generator).to(scan)
     uniform = draw(config.box_points, 3)
-    boundary, side = draw(config.rim_points, 3), (draw(config.rim_points, 1) * 6).long().clamp(max=5)
+    boundary, side = draw(config.boundary_points, 3), (draw(config.boundary_points, 1) * 6).long().clamp(max=5)
     boundary = boundary.scatter(2, side % 3, (side // 3).to(boundary))
     return QueryPoints(near, low + size * uniform, low + size * boundary)
 
 
 def query_field(avatar: ImplicitAvatar, scan: Tensor, space: QueryPoints, joint_transforms: Tensor) -> FieldValues:
-    """Distances and their gradients at the points of a step, in one evaluation, and colours where there are any.
+    """Distances, their gradients and colours, where there are any, at the points of a step, in one evaluation.
 
-    Gradients are those of the whole field, what the pose features change from place to place included. With
-    gradients switched on they can be differentiated again, as training does.
-
-    Args:
-        avatar: the field.
-        scan: ``(B, S, 3)`` canonical scan points.
-        space: query points.
-        joint_transforms: ``(B, J, 4, 4)`` posed_from_canonical.
+    Of canonical ``scan (B, S, 3)`` and ``joint_transforms (B, J, 4, 4)`` posed_from_canonical. Gradients are those of
+    the whole field, pose features included; with gradients switched on they can be differentiated again.
     """
     parts = [scan, space.near, space.uniform, space.boundary]
     learning = torch.is_grad_enabled()
@@ -155,11 +134,5 @@ def query_field(avatar: ImplicitAvatar, scan: Tensor, space: QueryPoints, joint_
     counts = [part.shape[1] for part in parts]
     surface, _, uniform, boundary = (distances if learning else distances.detach()).split(counts, dim=1)
     on_scan, near, in_box, _ = gradients.split(counts, dim=1)
-    return FieldValues(
-        surface=surface,
-        surface_gradients=on_scan,
-        space_gradients=torch.cat([near, in_box], dim=1),
-        uniform=uniform,
-        boundary=boundary,
-        colors=None if avatar.texture is None else avatar.colors(scan, joint_transforms),
-    )
+    colors = None if avatar.texture is None else avatar.colors(scan, joint_transforms)
+    return FieldValues(surface, on_scan, torch.cat([near, in_box], dim=1), uniform, boundary, colors)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +15,15 @@ from avatar.checks import DataError, check_file
 MAX_BYTES = 256 << 20
 MAX_JOINTS = 1000
 FARTHEST = 1e9  # of any number in a file: millimetres to the moon would do
-CHANNELS = {f"{axis.lower()}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
+MOVES = {f"{axis}position" for axis in "xyz"}
+CHANNELS = MOVES | {f"{axis}rotation" for axis in "xyz"}
 
 
 @dataclass(frozen=True)
 class BvhMotion:
-    """A BVH file, posed: J joints over T frames, parents before children, -1 for the root.
+    """A BVH file, posed: J joints over T frames, parents before children, -1 for the root, in the file's units.
 
-    ``offsets (J, 3)`` from the parent at rest; ``rotations (T, J, 3, 3)`` and ``positions (T, J, 3)`` in the world,
-    in the file's units; ``fps``.
+    ``offsets (J, 3)`` from the parent at rest; ``rotations (T, J, 3, 3)`` and ``positions (T, J, 3)`` in the world.
     """
 
     names: tuple[str, ...]
@@ -32,7 +34,7 @@ class BvhMotion:
     fps: float
 
 
-@dataclass
+@dataclass(eq=False)
 class _Joint:
     """A joint while its file is read."""
 
@@ -43,17 +45,13 @@ class _Joint:
 
 
 def read_bvh(path: Path) -> BvhMotion:
-    """Reads a BVH file.
-
-    Raises:
-        DataError: for a missing, oversized or damaged file, naming what was expected.
-    """
+    """Reads a BVH file; `DataError` for a missing, oversized or damaged one names what was expected."""
     path = Path(path)
     check_file(path, MAX_BYTES)
     try:
-        tokens = path.read_text(encoding="utf-8").split()
-        joints, at = _read_hierarchy(tokens)
-        values, fps = _read_frames(tokens, at, sum(len(joint.channels) for joint in joints))
+        tokens = deque(path.read_text(encoding="utf-8").split())
+        joints = _read_hierarchy(tokens)
+        values, fps = _read_frames(tokens, sum(len(joint.channels) for joint in joints))
     except UnicodeDecodeError as error:
         raise DataError(path, f"expected a BVH file, it is not text ({error.reason}).") from error
     except IndexError as error:
@@ -61,66 +59,60 @@ def read_bvh(path: Path) -> BvhMotion:
     except ValueError as error:
         raise DataError(path, f"expected a valid BVH file: {error}.") from error
     rotations, positions = _pose(joints, values)
-    names, parents = tuple(joint.name for joint in joints), tuple(joint.parent for joint in joints)
-    return BvhMotion(names, parents, np.array([joint.offset for joint in joints]), rotations, positions, fps)
+    names, parents, offsets = zip(*((joint.name, joint.parent, joint.offset) for joint in joints))
+    return BvhMotion(names, parents, np.array(offsets), rotations, positions, fps)
 
 
-def _read_hierarchy(tokens: list[str]) -> tuple[list[_Joint], int]:
-    """The joints, and where the frames begin."""
-    if tokens[0] != "HIERARCHY" or tokens[1] != "ROOT":
-        raise ValueError(f"it begins with {' '.join(tokens[:2])!r}, not with HIERARCHY ROOT")
+def _expect(tokens: deque[str], *expected: str) -> None:
+    for token in expected:
+        if (found := tokens.popleft()) != token:
+            raise ValueError(f"{found!r} stands where {token!r} was expected")
+
+
+def _read_hierarchy(tokens: deque[str]) -> list[_Joint]:
+    if (start := " ".join(islice(tokens, 2))) != "HIERARCHY ROOT":
+        raise ValueError(f"it begins with {start!r}, not with HIERARCHY ROOT")
+    tokens.popleft()
     joints: list[_Joint] = []
-    stack: list[int | None] = []  # open blocks; None is an end site
-    at = 1
-    while True:
-        token = tokens[at]
-        if token in ("ROOT", "JOINT"):
-            if len(joints) >= MAX_JOINTS or (token == "ROOT") != (not joints) or (stack and stack[-1] is None):
-                raise ValueError(f"{token} {tokens[at + 1]} stands where no joint can be")
-            joints.append(_Joint(tokens[at + 1], stack[-1] if stack else -1))
-            stack.append(len(joints) - 1)
-            at = _expect(tokens, at + 2, "{")
-        elif token == "End":
-            stack.append(None)
-            at = _expect(tokens, at + 2, "{")
+    stack: list[_Joint | None] = []  # open blocks; None is an end site
+    while stack or not joints:
+        token = tokens.popleft()
+        if token in ("ROOT", "JOINT", "End"):
+            name, joint = tokens.popleft(), None
+            if token != "End":
+                if len(joints) >= MAX_JOINTS or (token == "ROOT") != (not joints) or (stack and stack[-1] is None):
+                    raise ValueError(f"{token} {name} stands where no joint can be")
+                joint = _Joint(name, joints.index(stack[-1]) if stack else -1)
+                joints.append(joint)
+            stack.append(joint)
+            _expect(tokens, "{")
         elif token == "OFFSET":
-            offset = [float(value) for value in tokens[at + 1 : at + 4]]
-            if len(offset) != 3 or not np.abs(offset).max() <= FARTHEST:
-                raise ValueError(f"the offset {' '.join(tokens[at + 1 : at + 4])} is none")
+            words = [tokens.popleft() for _ in range(3)]
+            offset = [float(word) for word in words]
+            if not np.abs(offset).max() <= FARTHEST:
+                raise ValueError(f"the offset {' '.join(words)} is none")
             if stack[-1] is not None:
-                joints[stack[-1]].offset = offset
-            at += 4
+                stack[-1].offset = offset
         elif token == "CHANNELS":
-            count = int(tokens[at + 1])
-            channels = [name.lower() for name in tokens[at + 2 : at + 2 + count]]
+            count = int(tokens.popleft())
+            channels = [tokens.popleft().lower() for _ in range(count)]
             if stack[-1] is None or not set(channels) <= CHANNELS or len(set(channels)) != count:
                 raise ValueError(f"channels {' '.join(channels)} are not those of a joint")
-            joints[stack[-1]].channels = channels
-            at += 2 + count
+            stack[-1].channels = channels
         elif token == "}":
             stack.pop()
-            at += 1
-            if not stack:
-                return joints, at
         else:
             raise ValueError(f"{token!r} stands where a joint, OFFSET, CHANNELS or }} was expected")
+    return joints
 
 
-def _expect(tokens: list[str], at: int, token: str) -> int:
-    """The place after an expected token."""
-    if tokens[at] != token:
-        raise ValueError(f"{tokens[at]!r} stands where {token!r} was expected")
-    return at + 1
-
-
-def _read_frames(tokens: list[str], at: int, channels: int) -> tuple[np.ndarray, float]:
-    """Channel values ``(T, channels)`` and frames per second."""
-    for token in ("MOTION", "Frames:"):
-        at = _expect(tokens, at, token)
-    frames = int(tokens[at])
-    at = _expect(tokens, _expect(tokens, at + 1, "Frame"), "Time:")
-    seconds = float(tokens[at])
-    values = np.array(tokens[at + 1 :], dtype=np.float64)
+def _read_frames(tokens: deque[str], channels: int) -> tuple[np.ndarray, float]:
+    """Channel values ``(T, channels)`` and frames per second, from what is left of a file's tokens."""
+    _expect(tokens, "MOTION", "Frames:")
+    frames = int(tokens.popleft())
+    _expect(tokens, "Frame", "Time:")
+    seconds = float(tokens.popleft())
+    values = np.array(list(tokens), dtype=np.float64)
     if frames < 1 or channels < 3 or values.size != frames * channels:
         raise ValueError(f"{frames} frames of {channels} channels were expected, {values.size} numbers are there")
     if not np.abs(values).max() <= FARTHEST or not 1e-4 <= seconds <= 10:
@@ -130,23 +122,18 @@ def _read_frames(tokens: list[str], at: int, channels: int) -> tuple[np.ndarray,
 
 def _pose(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations and positions in the world. Position channels stand in the place of the offset."""
-    rotations = np.zeros((len(values), len(joints), 3, 3))
-    positions = np.zeros((len(values), len(joints), 3))
-    column = 0
+    frames, column = len(values), 0
+    rotations, positions = np.zeros((frames, len(joints), 3, 3)), np.zeros((frames, len(joints), 3))
     for index, joint in enumerate(joints):
-        own = values[:, column : column + len(joint.channels)]
+        own = dict(zip(joint.channels, values[:, column : column + len(joint.channels)].T))
         column += len(joint.channels)
-        place = np.tile(np.array(joint.offset), (len(values), 1))
-        order, angles = "", []
-        for channel, value in zip(joint.channels, own.T):
-            if channel.endswith("position"):
-                place[:, "xyz".index(channel[0])] = value
-            else:
-                order += channel[0].upper()
-                angles.append(value)
-        turn = np.tile(np.eye(3), (len(values), 1, 1))
-        if order:
-            turn = Rotation.from_euler(order, np.stack(angles, axis=-1), degrees=True).as_matrix()
+        place = np.tile(np.array(joint.offset), (frames, 1))
+        for channel in own.keys() & MOVES:
+            place[:, "xyz".index(channel[0])] = own[channel]
+        turn = np.tile(np.eye(3), (frames, 1, 1))
+        if order := "".join(channel[0].upper() for channel in own if channel not in MOVES):
+            angles = np.stack([own[f"{axis.lower()}rotation"] for axis in order], axis=-1)
+            turn = Rotation.from_euler(order, angles, degrees=True).as_matrix()
         if joint.parent < 0:
             rotations[:, index], positions[:, index] = turn, place
         else:

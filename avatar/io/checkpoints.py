@@ -16,10 +16,8 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
+import safetensors.torch
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
@@ -37,24 +35,13 @@ NAME = re.compile(r"step-(\d{8,})\.([0-9a-f]{16})\.pt")  # the step, and the fir
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float | None = None) -> Path:
-    """Writes the resume state of a step, keeps the last two and the best, and forgets older ones.
+    """Writes the resume state of a step, keeps the last two and the best (lowest score), and forgets older ones.
 
-    A file is on disk before the manifest names it, no file is ever written over, and the manifest is replaced whole:
-    a crash or a full disk at any moment leaves the checkpoints from before valid.
-
-    Args:
-        folder: the run's ``checkpoints`` folder; one job at a time (`locks.lock_folder`).
-        state: nested dicts and lists of tensors and plain values (it is read back with ``weights_only``).
-        step: optimiser steps done.
-        best: validation score; the checkpoint with the lowest so far is kept as the best.
-
-    Raises:
-        AvatarError: when the state holds a number that is not finite; nothing is written then.
-        DataError: when the disk refuses, saying how much room was needed and what there is still.
+    A file is on disk before the manifest names it, no file is ever written over, and the manifest is replaced whole: a
+    crash or a full disk at any moment leaves earlier checkpoints valid. Raises `AvatarError` for a number that is not
+    finite (nothing is written then), `DataError` when the disk refuses, saying how much room was needed.
     """
-    for name, value in named_tensors(state):
-        if not _is_finite(value):
-            raise AvatarError(f"{name}: expected finite weights at step {step}; this checkpoint was not written.")
+    _check_weights(named_tensors(state), f" at step {step}; this checkpoint")
     best = best if best is not None and math.isfinite(best) else None
     buffer = io.BytesIO()
     torch.save({**state, "score": best}, buffer)
@@ -74,9 +61,10 @@ def save_checkpoint(folder: Path, state: dict[str, Any], step: int, best: float 
     except DataError as error:
         free = shutil.disk_usage(folder if folder.is_dir() else ".").free
         kept = f"step {before['last'][-1]['step']}" if before.get("last") else "none"
-        problem = f"could not write a checkpoint ({getattr(error.__cause__, 'strerror', error.__cause__)}; "
-        problem += f"{len(data):,} bytes needed, {free:,} free). The last one written: {kept}."
-        raise DataError(folder, problem, "Make room and give the same command again.") from error
+        reason = getattr(error.__cause__, "strerror", error.__cause__)
+        needed = f"{reason}; {len(data):,} bytes needed, {free:,} free"
+        problem = f"could not write a checkpoint ({needed}). The last one written: {kept}."
+        raise DataError(folder, problem, "Free disk space and give the same command again.") from error
     listed = {kept["file"] for kept in (*entries["last"], entries.get("best", entry))}
     for path in (*folder.glob("step-*.pt"), *folder.glob(".*.tmp-*")):
         if path.name not in listed:
@@ -97,11 +85,14 @@ def _is_finite(value: Tensor) -> bool:
     return not value.is_floating_point() or bool(torch.isfinite(value).all())
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """The checkpoints a folder lists: ``last`` (oldest first) and ``best``; empty when there are none.
+def _check_weights(weights: Iterable[tuple[str, Tensor]], what: str) -> None:
+    for name, value in weights:
+        if not _is_finite(value):
+            raise AvatarError(f"{name}: expected finite weights{what} was not written.")
 
-    A damaged manifest is made again from the checkpoints, with a warning: their names hold step and hash.
-    """
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The checkpoints a folder lists, ``last`` (oldest first) and ``best``; made again from their names if damaged."""
     path = folder / MANIFEST
     if path.is_file():
         try:
@@ -112,11 +103,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             pass  # not JSON: as damaged as a wrong hash
         warnings.warn(f"{path}: damaged; made again from the checkpoints beside it.", stacklevel=2)
     found = []
-    for file in sorted(folder.glob("step-*.pt")):
-        if match := NAME.fullmatch(file.name):
-            entry = {"file": file.name, "step": int(match[1]), "score": None, "sha256": match[2]}
-            state = _read_valid(folder, entry)
-            found += [] if state is None else [entry | {"score": state["score"]}]
+    for match in filter(None, (NAME.fullmatch(file.name) for file in sorted(folder.glob("step-*.pt")))):
+        entry = {"file": match[0], "step": int(match[1]), "sha256": match[2]}
+        if (state := _read_valid(folder, entry)) is not None:
+            found.append(entry | {"score": state["score"]})
     scored = [entry for entry in found if entry["score"] is not None]
     best = {"best": min(scored, key=lambda entry: (entry["score"], -entry["step"]))} if scored else {}
     return {"last": found, **best} if found else {}
@@ -124,17 +114,16 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def _is_listing(entries: dict[str, Any]) -> bool:
     """Whether a manifest lists checkpoints of its own folder: a seal can be forged, a name could lead elsewhere."""
-    last = entries.get("last", [])
-    listed = [*last, *([entries["best"]] if "best" in entries else [])] if isinstance(last, list) else [None]
-    valid = all(
+    last, best = entries.get("last", []), [entries[key] for key in ("best",) if key in entries]
+    valid = isinstance(last, list) and all(
         isinstance(entry, dict)
         and NAME.fullmatch(str(entry.get("file")))
         and type(entry.get("step")) is int
         and isinstance(entry.get("score"), (int, float, NoneType))
         and re.fullmatch("[0-9a-f]{16,64}", str(entry.get("sha256")))
-        for entry in listed
+        for entry in (*last, *best)
     )
-    return valid and all(entry["score"] is not None for entry in listed[len(last) :])
+    return valid and all(entry["score"] is not None for entry in best)
 
 
 def _read_valid(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
@@ -156,11 +145,7 @@ def _read_valid(folder: Path, entry: dict[str, Any]) -> dict[str, Any] | None:
 
 @contextmanager
 def restoring(folder: Path) -> Iterator[None]:
-    """Turns whatever goes wrong while a state is taken over into one error: it is another network's, or a forgery.
-
-    Raises:
-        DataError: naming the folder and the reason.
-    """
+    """Turns whatever goes wrong while a state is taken over into a `DataError`: another network's, or a forgery."""
     try:
         yield
     except AvatarError:
@@ -185,40 +170,28 @@ class Budget(TorchFunctionMode):
             asked = math.prod(int(size) for size in sizes if isinstance(size, int))
             self.left -= asked
             if self.left < 0:
-                raise AvatarError(
-                    f"settings: they ask for a network of {asked} numbers, the weights beside it have less."
-                )
+                problem = f"they ask for a network of {asked} numbers, the weights beside it have less."
+                raise AvatarError(f"settings: {problem}")
         return function(*arguments, **options)
 
 
 @contextmanager
 def building(path: Path, weights: Mapping[str, Tensor]) -> Iterator[None]:
-    """Builds and fills a network within a ``with`` block; sizes that its file invents are refused unallocated.
-
-    Raises:
-        DataError: naming the file, when the settings ask for more than the weights hold, or the two do not fit.
-    """
+    """Builds and fills a network within a ``with`` block; `DataError` for sizes beyond those of its weights."""
     with restoring(path), Budget(FACTOR * sum(value.numel() for value in weights.values()) + SPARE):
         yield
 
 
 def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
-    """The resume state of the newest valid checkpoint (``last``) or of the best (``best``); None without any.
+    """The newest valid resume state (``last``) or the best (``best``); None without any.
 
-    A checkpoint whose bytes do not match its hash is passed over with a warning that names both files.
-
-    Raises:
-        DataError: when checkpoints are listed and none of them is valid.
+    A damaged one is passed over with a warning. Raises `DataError` when those listed are all damaged.
     """
     entries = read_manifest(folder)
-    listed = [entries["best"]] if which == "best" and "best" in entries else []
-    if which == "last":
-        listed = list(reversed(entries.get("last", [])))
-    for position, entry in enumerate(listed):
-        state = _read_valid(folder, entry)
-        if state is not None:
+    listed = entries.get("last", [])[::-1] if which == "last" else [entries[key] for key in (which,) if key in entries]
+    for entry, following in zip(listed, [*(entry["file"] for entry in listed[1:]), "nothing"]):
+        if (state := _read_valid(folder, entry)) is not None:
             return state
-        following = listed[position + 1]["file"] if position + 1 < len(listed) else "nothing"
         damaged = folder / entry["file"]
         warnings.warn(f"{damaged}: damaged or missing checkpoint; falling back to {following}.", stacklevel=2)
     if listed or (which == "last" and any(folder.glob("step-*.pt"))):
@@ -227,15 +200,9 @@ def load_checkpoint(folder: Path, which: str = "last") -> dict[str, Any] | None:
 
 
 def write_weights(path: Path, weights: dict[str, Tensor], description: dict[str, Any]) -> None:
-    """Writes weights to share: ``<path>.safetensors`` and ``<path>.json`` (description and sha256).
-
-    Raises:
-        AvatarError: when a weight is not finite; nothing is written then.
-    """
-    for name, value in weights.items():
-        if not _is_finite(value):
-            raise AvatarError(f"{name}: expected finite weights; {path}.safetensors was not written.")
-    data = save_tensors({name: value.contiguous().cpu() for name, value in weights.items()})
+    """Writes ``<path>.safetensors`` and ``<path>.json`` (description, sha256); `AvatarError` if not finite."""
+    _check_weights(weights.items(), f"; {path}.safetensors")
+    data = safetensors.torch.save({name: value.contiguous().cpu() for name, value in weights.items()})
     described = description | {"sha256": hashlib.sha256(data).hexdigest()}
     write_whole(path.with_suffix(".safetensors"), data)
     write_whole(path.with_suffix(".json"), json.dumps(described, indent=1).encode())
@@ -244,9 +211,7 @@ def write_weights(path: Path, weights: dict[str, Tensor], description: dict[str,
 def read_weights(path: Path, facts: Iterable[str] = ()) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights and description as `write_weights` left them; ``facts`` are the keys the description must have.
 
-    Raises:
-        DataError: when a file is missing, a fact is missing, the weights do not match the hash in their description,
-            or are not finite.
+    Raises `DataError` for a missing file or fact, and weights that are not finite or not those of the hash.
     """
     weights, described = check_trained(path)
     description = read_json(described)
@@ -258,9 +223,9 @@ def read_weights(path: Path, facts: Iterable[str] = ()) -> tuple[dict[str, Tenso
         hint = "Give the command that made it again."
         raise DataError(weights, "damaged: its sha256 is not the one in its description.", hint)
     try:
-        tensors = load_tensors(data)
+        tensors = safetensors.torch.load(data)
         for name, value in tensors.items():
             check_finite(name, value)
-    except (SafetensorError, AvatarError) as error:
+    except (safetensors.SafetensorError, AvatarError) as error:
         raise DataError(weights, f"expected finite weights ({error}).") from error
     return tensors, description

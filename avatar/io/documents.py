@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +17,22 @@ MAX_DEPTH = 50
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file that holds one mapping of plain values.
+    """A YAML file that holds one mapping of plain values; `DataError` for anything else, and for files too large.
 
-    Tags that make objects are refused by the safe loader; anchors, which let a kilobyte stand for a gigabyte, and
-    nesting deeper than 50 are refused here, before anything is built.
-
-    Raises:
-        DataError: for a missing, oversized or damaged file, or one that holds anything else.
+    The safe loader refuses tags that make objects; anchors (a kilobyte may stand for a gigabyte) and deep nesting are
+    refused before anything is built.
     """
-    text = _read_text(path, YAML_BYTES)
-    try:
+
+    def parse(text: str) -> Any:
         check_events(path, text)
-        values = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(path, f"expected plain YAML: {error!s:.300}.") from error
-    return _check_mapping(path, values)
+        return yaml.safe_load(text)
+
+    return _read_mapping(path, YAML_BYTES, "plain YAML", parse)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file that holds one object. Raises `DataError` as `read_yaml` does."""
+    return _read_mapping(path, JSON_BYTES, "JSON", json.loads)
 
 
 def check_events(path: Path, text: str) -> list[str]:
@@ -47,29 +47,16 @@ def check_events(path: Path, text: str) -> list[str]:
     return scalars
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON file that holds one object.
-
-    Raises:
-        DataError: for a missing, oversized or damaged file, or one that holds anything else.
-    """
-    text = _read_text(path, JSON_BYTES)
-    try:
-        values = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(path, f"expected JSON: {error!s:.300}.") from error
-    return _check_mapping(path, values)
-
-
-def _read_text(path: Path, limit: int) -> str:
+def _read_mapping(path: Path, limit: int, kind: str, parse: Callable[[str], Any]) -> dict[str, Any]:
     check_file(path, limit)
     try:
-        return path.read_text(encoding="utf-8")
+        values = parse(path.read_text(encoding="utf-8"))
+    except DataError:
+        raise
     except UnicodeDecodeError as error:
         raise DataError(path, f"expected text, reading failed: {error}.") from error
-
-
-def _check_mapping(path: Path, values: Any) -> dict[str, Any]:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise DataError(path, f"expected {kind}: {error!s:.300}.") from error
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise DataError(path, f"expected a mapping of names to values, got {type(values).__name__}.")
     return values

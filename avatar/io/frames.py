@@ -1,4 +1,4 @@
-"""The open dataset's files: frames with cloth to 0.05 mm, garments, and the manifest of hashes."""
+"""Files of data sets: frames with cloth to 0.05 mm, garments, canonical scans, and the manifest of hashes."""
 
 from __future__ import annotations
 
@@ -11,23 +11,41 @@ import numpy as np
 from avatar.checks import AvatarError, DataError, check_faces, check_finite, check_shape
 from avatar.io.documents import read_json
 from avatar.io.ledger import file_digest
-from avatar.io.npz import read_arrays, write_arrays, write_whole
+from avatar.io.npz import naming, read_arrays, write_described, write_whole
+from avatar.records import CanonicalScan
 
 QUANTUM = 5e-5  # metres: 0.05 mm
-FRAME_FORMAT, GARMENT_FORMAT, MANIFEST_FORMAT = "open-frame/1", "open-garment/1", "manifest/1"
+FRAME_FORMAT, GARMENT_FORMAT = "open-frame/1", "open-garment/1"
+SCAN_FORMAT, MANIFEST_FORMAT = "canonical-scan/1", "manifest/1"
 MANIFEST = "manifest.json"
 FARTHEST = 1000.0  # metres; the rounding of float32 is 0.06 mm there
 FRAME_BYTES = 64 << 20  # far above any frame; refuses a file that swells on unpacking
+FRAME = {
+    "pose": "float J 3",
+    "translation": "float 3",
+    "origin": "float 3",
+    "cloth_high": "uint8 3 V",
+    "cloth_low": "uint8 3 V",
+    "face_counts": "int 2",
+    "visible_body": "uint8 B",
+    "visible_cloth": "uint8 C",
+    "penetration": "float 2",
+}
+HISTORY = {"history": "int "}
+GARMENT = {"faces": "int F 3", "canonical": "float V 3", "labels": "uint8 V", "names": "text G"}
+SCAN = {"points": "float M 3", "normals": "float M 3", "weights": "uint16 J M", "source": "int M"}
+SCAN_EXTRAS = {"faces": "int F 3", "colors": "float M 3"}
+WEIGHT_STEPS = np.iinfo(np.uint16).max  # weights are stored in this many steps: 15 millionths each
+FAST = 1  # level of deflating: as small as level 9 but for 2%, in a tenth of the time
+UNIT_TOLERANCE = 1e-2  # of normals and of the sums of weights
 
 
 @dataclass(frozen=True)
 class OpenFrame:
-    """One simulated frame of the open dataset: the body's pose, the cloth, and which faces can be seen.
+    """One simulated frame: ``pose (J, 3)`` axis-angle, ``translation (3,)``, posed ``cloth (Vc, 3)``, visible faces.
 
-    ``pose (J, 3)`` axis-angle, radians; ``translation (3,)`` metres; ``cloth (Vc, 3)`` metres, posed;
-    ``visible_body (Fb,)`` and ``visible_cloth (Fc,)`` bool per face; ``penetration_share`` share of cloth
-    vertices inside the body, ``penetration_depth`` the deepest of them, metres; ``history`` how many frames were
-    simulated one after another before it: 0 where the cloth settled in this pose alone.
+    ``penetration_share`` of cloth vertices inside the body, ``penetration_depth`` of the deepest, metres; ``history``
+    counts the frames simulated before it, 0 where the cloth settled in this pose alone.
     """
 
     pose: np.ndarray
@@ -42,10 +60,8 @@ class OpenFrame:
 
 @dataclass(frozen=True)
 class OpenGarment:
-    """What all frames of an outfit share: the cloth's topology and its rest in the canonical pose.
-
-    ``faces (Fc, 3)``; ``canonical (Vc, 3)`` cloth settled in the canonical pose, metres; ``labels (Vc,)``
-    uint8, 1 for the first garment of ``names``.
+    """What all frames of an outfit share: ``faces (Fc, 3)``, ``canonical (Vc, 3)`` cloth at rest, metres, and
+    ``labels (Vc,)`` uint8, 1 for the first of ``names``.
     """
 
     faces: np.ndarray
@@ -55,19 +71,12 @@ class OpenGarment:
 
 
 def write_open_frame(path: Path, frame: OpenFrame) -> None:
-    """Writes a frame; cloth is rounded to 0.05 mm, everything else is exact.
+    """Writes a frame; cloth is rounded to 0.05 mm, as steps from vertex to vertex in mesh order, which deflate well.
 
-    Cloth is stored as steps from vertex to vertex in mesh order, high bytes apart from low bytes, because
-    both deflate well that way.
-
-    Raises:
-        AvatarError: on wrong shapes, non-finite numbers or cloth wider than 3.2 m.
+    Raises `AvatarError` on wrong shapes, non-finite numbers or cloth wider than 3.2 m.
     """
-    check_shape("pose", frame.pose, "J 3")
-    check_shape("translation", frame.translation, "3")
     check_shape("cloth", frame.cloth, "V 3")
-    for name in ("pose", "translation", "cloth"):
-        check_finite(name, getattr(frame, name))
+    check_finite("cloth", frame.cloth)
     cloth = np.asarray(frame.cloth, np.float64)
     origin = ((cloth.min(axis=0) + cloth.max(axis=0)) / 2).astype(np.float32)
     quanta = np.rint((cloth - origin) / QUANTUM)
@@ -75,44 +84,24 @@ def write_open_frame(path: Path, frame: OpenFrame) -> None:
         raise AvatarError(f"cloth: expected at most 3.2 m across, got {np.ptp(cloth, axis=0).max():.2f} m.")
     steps = np.diff(quanta.astype(np.int16).view(np.uint16), axis=0, prepend=np.uint16(0)).T
     folded = np.where(steps < 1 << 15, steps << 1, ~(steps << 1))  # small steps either way: small numbers
-    numbers = {
-        "format": np.array(FRAME_FORMAT),
-        "pose": np.asarray(frame.pose, np.float32),
-        "translation": np.asarray(frame.translation, np.float32),
+    values = {
+        "pose": frame.pose,
+        "translation": frame.translation,
         "origin": origin,
-        "cloth_high": (folded >> 8).astype(np.uint8),
-        "cloth_low": (folded & 255).astype(np.uint8),
-        "face_counts": np.array([len(frame.visible_body), len(frame.visible_cloth)], np.int32),
+        "cloth_high": folded >> 8,
+        "cloth_low": folded & 255,
+        "face_counts": [len(frame.visible_body), len(frame.visible_cloth)],
         "visible_body": np.packbits(np.asarray(frame.visible_body, bool)),
         "visible_cloth": np.packbits(np.asarray(frame.visible_cloth, bool)),
-        "penetration": np.array([frame.penetration_share, frame.penetration_depth], np.float32),
+        "penetration": [frame.penetration_share, frame.penetration_depth],
+        "history": frame.history or None,
     }
-    write_arrays(path, numbers | ({"history": np.array(frame.history, np.int32)} if frame.history else {}))
+    write_described(path, FRAME_FORMAT, FRAME | HISTORY, values)
 
 
 def read_open_frame(path: Path) -> OpenFrame:
-    """Reads a frame of the open dataset.
-
-    Raises:
-        DataError: when the file is missing, damaged, of another format or version.
-    """
-    stored = read_arrays(
-        path,
-        {
-            "pose": "float J 3",
-            "translation": "float 3",
-            "origin": "float 3",
-            "cloth_high": "uint8 3 V",
-            "cloth_low": "uint8 3 V",
-            "face_counts": "int 2",
-            "visible_body": "uint8 B",
-            "visible_cloth": "uint8 C",
-            "penetration": "float 2",
-        },
-        {"history": "int "},
-        limit=FRAME_BYTES,
-        version=FRAME_FORMAT,
-    )
+    """Reads a frame of the open dataset; `DataError` for a missing or damaged file, another format or version."""
+    stored = read_arrays(path, FRAME, HISTORY, FRAME_BYTES, FRAME_FORMAT)
     for key in ("origin", "translation"):
         if np.abs(stored[key]).max() > FARTHEST:
             raise DataError(path, f"{key}: expected metres within {FARTHEST:g} of the origin, got {stored[key]}.")
@@ -124,54 +113,85 @@ def read_open_frame(path: Path) -> OpenFrame:
         if (count + 7) // 8 != len(stored[key]):
             raise DataError(path, f"{key}: expected bits for {count} faces, got {len(stored[key])} bytes.")
         visible[key] = np.unpackbits(stored[key], count=count).astype(bool)
+    cloth = (quanta * QUANTUM + stored["origin"]).astype(np.float32)
+    share, depth = stored["penetration"].tolist()
+    history = int(stored.get("history", 0))
     return OpenFrame(
-        pose=stored["pose"],
-        translation=stored["translation"],
-        cloth=(quanta * QUANTUM + stored["origin"]).astype(np.float32),
-        penetration_share=float(stored["penetration"][0]),
-        penetration_depth=float(stored["penetration"][1]),
-        history=int(stored.get("history", 0)),
+        stored["pose"],
+        stored["translation"],
+        cloth,
         **visible,
+        penetration_share=share,
+        penetration_depth=depth,
+        history=history,
     )
 
 
 def write_open_garment(path: Path, garment: OpenGarment) -> None:
     """Writes an outfit's garment. Raises `AvatarError` on wrong shapes, face indices or labels."""
-    dims = check_shape("canonical", garment.canonical, "V 3")
-    check_shape("labels", garment.labels, "V", **dims)
-    check_finite("canonical", garment.canonical)
     _check_garment(garment)
-    write_arrays(
-        path,
-        {
-            "format": np.array(GARMENT_FORMAT),
-            "faces": np.asarray(garment.faces, np.int32),
-            "canonical": np.asarray(garment.canonical, np.float32),
-            "labels": np.asarray(garment.labels, np.uint8),
-            "names": np.array(garment.names, dtype=np.str_),
-        },
-    )
+    write_described(path, GARMENT_FORMAT, GARMENT, {key: getattr(garment, key) for key in GARMENT})
 
 
 def read_open_garment(path: Path) -> OpenGarment:
     """Reads an outfit's garment; faces come as int64. Raises `DataError` when the file is not valid."""
-    keys = {"faces": "int F 3", "canonical": "float V 3", "labels": "uint8 V", "names": "text G"}
-    stored = read_arrays(path, keys, limit=FRAME_BYTES, version=GARMENT_FORMAT)
-    names = tuple(str(name) for name in stored["names"])
-    garment = OpenGarment(stored["faces"].astype(np.int64), stored["canonical"], stored["labels"], names)
-    try:
+    stored = read_arrays(path, GARMENT, limit=FRAME_BYTES, version=GARMENT_FORMAT)
+    faces, names = stored["faces"].astype(np.int64), tuple(stored["names"].tolist())
+    garment = OpenGarment(faces, stored["canonical"], stored["labels"], names)
+    with naming(path):
         _check_garment(garment)
-    except AvatarError as error:
-        raise DataError(path, str(error)) from error
     return garment
 
 
 def _check_garment(garment: OpenGarment) -> None:
-    """Refuses faces or labels that point at nothing."""
     check_faces(np.asarray(garment.faces), len(garment.canonical))
     labels = np.asarray(garment.labels)
+    check_shape("labels", labels, "V", V=len(garment.canonical))
     if labels.min() < 1 or labels.max() > len(garment.names):
         raise AvatarError(f"labels: expected 1 to {len(garment.names)}, one number for each of {garment.names}.")
+
+
+def write_canonical_scan(path: str | Path, scan: CanonicalScan) -> None:
+    """Writes a canonical scan; weights are rounded to 1/65535, joint by joint, which deflates fast.
+
+    Raises `AvatarError` as `check_canonical_scan` does.
+    """
+    check_canonical_scan(scan)
+    weights = np.rint(np.asarray(scan.weights).T * WEIGHT_STEPS).astype(np.uint16)
+    values = vars(scan) | {"weights": weights}
+    described = SCAN | SCAN_EXTRAS
+    write_described(Path(path), SCAN_FORMAT, described, {key: values[key] for key in described}, FAST)
+
+
+def read_canonical_scan(path: str | Path) -> CanonicalScan:
+    """Reads a canonical scan; indices come as int64. Raises `DataError` naming the file and what is wrong with it."""
+    stored = read_arrays(path := Path(path), SCAN, SCAN_EXTRAS, version=SCAN_FORMAT)
+    weights = stored["weights"].T.astype(np.float32)
+    stored["weights"] = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1)
+    scan = CanonicalScan(**{key: a.astype(np.int64) if a.dtype.kind in "iu" else a for key, a in stored.items()})
+    with naming(path, "Canonicalize the scan again."):
+        check_canonical_scan(scan)
+    return scan
+
+
+def check_canonical_scan(scan: CanonicalScan) -> None:
+    """Refuses a canonical scan that is empty, not finite, or points at what it lacks; `AvatarError` names the field."""
+    dims = check_shape("points", scan.points, "M 3")
+    check_shape("normals", scan.normals, "M 3", **dims)
+    check_shape("weights", scan.weights, "M J", **dims)
+    check_shape("source", scan.source, "M", **dims)
+    if not dims["M"]:
+        raise AvatarError("points: expected at least one, got none.")
+    for name in ("points", "normals", "weights"):
+        check_finite(name, getattr(scan, name))
+    for name, lengths in (("normals", np.linalg.norm(scan.normals, axis=1)), ("weights", scan.weights.sum(axis=1))):
+        worst = float(lengths[np.abs(lengths - 1).argmax()])
+        if abs(worst - 1) > UNIT_TOLERANCE:
+            raise AvatarError(f"{name}: expected unit normals and rows of weights summing to 1, got {worst:.4g}.")
+    if scan.weights.min() < 0 or scan.source.min() < 0 or (np.diff(scan.source) <= 0).any():
+        raise AvatarError("weights, source: expected no negative weight and rising indices, got others.")
+    if scan.faces is not None:
+        check_faces(scan.faces, dims["M"])
 
 
 def _listed_files(folder: Path) -> dict[str, Path]:
@@ -184,19 +204,15 @@ def _listed_files(folder: Path) -> dict[str, Path]:
 def write_manifest(folder: Path) -> Path:
     """Records size and sha256 of a dataset folder's files in its ``manifest.json``; returns its path."""
     folder = Path(folder)
-    listed = _listed_files(folder)
-    files = {name: {"size": path.stat().st_size, "sha256": file_digest(path)} for name, path in listed.items()}
+    listed = _listed_files(folder).items()
+    files = {name: {"size": path.stat().st_size, "sha256": file_digest(path)} for name, path in listed}
     text = json.dumps({"format": MANIFEST_FORMAT, "files": files}, indent=1)
     write_whole(folder / MANIFEST, f"{text}\n".encode())
     return folder / MANIFEST
 
 
 def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
-    """Compares a dataset folder with its manifest: the same files of the same sizes, and hashes where asked.
-
-    Raises:
-        DataError: naming the file that is missing, changed or not in the manifest.
-    """
+    """Compares a dataset folder with its manifest, with hashes where asked; `DataError` names the file that differs."""
     folder = Path(folder)
     path = folder / MANIFEST
     try:
@@ -207,14 +223,17 @@ def check_manifest(folder: Path, verify_hashes: bool = False) -> None:
     if manifest.get("format") != MANIFEST_FORMAT:
         raise DataError(path, f"expected format {MANIFEST_FORMAT}, got {manifest.get('format')}.")
     files = _listed_files(folder)
-    for name in [*known, *(name for name in files if name not in known)]:
-        hint = "Make or download it again, or write the manifest anew if the change is meant."
+    for name in known | files:
+        size, digest = known.get(name, (0, ""))
         if name not in files:
-            raise DataError(folder / name, "the manifest lists it, it is not there.", hint)
-        if name not in known:
-            raise DataError(files[name], "it is not in the manifest.", hint)
-        size, digest = known[name]
-        if files[name].stat().st_size != size:
-            raise DataError(files[name], f"expected {size} bytes, got {files[name].stat().st_size}.", hint)
-        if verify_hashes and file_digest(files[name]) != digest:
-            raise DataError(files[name], "its sha256 is not the manifest's: the content has changed.", hint)
+            problem = "the manifest lists it, it is not there."
+        elif name not in known:
+            problem = "it is not in the manifest."
+        elif (found := files[name].stat().st_size) != size:
+            problem = f"expected {size} bytes, got {found}."
+        elif verify_hashes and file_digest(files[name]) != digest:
+            problem = "its sha256 is not the manifest's: the content has changed."
+        else:
+            continue
+        hint = "Make or download it again, or write the manifest anew if the change is meant."
+        raise DataError(folder / name, problem, hint)

@@ -35,48 +35,37 @@ SOURCES = read_sources(PACKAGE)  # as the program began: a file edited while it 
 class Ledger:
     """The finished pieces of work in a folder, each by name and key, so that a command goes on where it stopped.
 
-    The key is a hash of everything a piece was made from. A piece counts as finished when its key is there and its
-    files still have the sha256 they were written with; a damaged, changed or missing one is to be done again. Pieces
-    of one name and several keys stand beside each other. Lines are only ever added, under a lock, each sealed with its
-    own hash: one that a killed process left half-written is passed over, and takes no other with it.
+    A key is a hash of everything a piece was made from; a piece is finished when its files still have the sha256 they
+    were written with. Lines are only added, under a lock, each with its own hash: a half-written one is passed over.
     """
 
     def __init__(self, folder: Path):
-        """Reads what a folder's ledger says; a folder without one has finished nothing."""
         self.path = Path(folder) / LEDGER
         self.entries: dict[str, dict[str, dict[str, Any]]] = {}  # by name and key
-        for line in self.path.read_bytes().splitlines() if self.path.is_file() else ():
-            entry = _unseal(line)
-            if entry is not None:
-                self._keep(entry)
+        lines = self.path.read_bytes().splitlines() if self.path.is_file() else ()
+        self._keep(filter(None, map(_unseal, lines)))
 
     def find(self, name: str, key: str) -> Any:
         """What was noted of a finished piece (`True` where nothing was), or None where it has to be done."""
         entry = self.entries.get(name, {}).get(key)
         if entry is None:
             return None
-        for file, digest in entry["files"].items():
-            path = self.path.parent / file
-            if not path.is_file() or file_digest(path) != digest:
-                return None
+        paths = {self.path.parent / file: digest for file, digest in entry["files"].items()}
+        if not all(path.is_file() and file_digest(path) == digest for path, digest in paths.items()):
+            return None
         WORK["found"] += 1
         return True if entry["note"] is None else entry["note"]
 
     def record(self, name: str, key: str, files: Iterable[Path] = (), note: Any = None) -> None:
         """Notes a finished piece: its files, which are on the disk already, or plain values.
 
-        Raises:
-            DataError: when the disk refuses.
+        Raises `DataError` when the disk refuses.
         """
         listed = {os.path.relpath(path, self.path.parent): file_digest(path) for path in files}
         self._append([{"name": name, "key": key, "files": listed, "note": note}])
 
     def record_notes(self, key: str, notes: Mapping[str, Any]) -> None:
-        """Notes several finished pieces of one key, each by name with its plain values.
-
-        Raises:
-            DataError: when the disk refuses.
-        """
+        """Notes several finished pieces of one key, each by name with its plain values, as `record` does."""
         self._append([{"name": name, "key": key, "files": {}, "note": note} for name, note in notes.items()])
 
     def _append(self, entries: list[dict[str, Any]]) -> None:
@@ -91,14 +80,14 @@ class Ledger:
                     lines = lines if stream.read(1) == b"\n" else b"\n" + lines  # behind a half-written line
                 stream.write(lines)
         except OSError as error:
-            hint = "Make room and give the same command again."
+            hint = "Free disk space and give the same command again."
             raise DataError(self.path, f"could not be written ({error.strerror}).", hint) from error
-        for entry in entries:
-            self._keep(entry)
+        self._keep(entries)
         WORK["made"] += len(entries)
 
-    def _keep(self, entry: dict[str, Any]) -> None:
-        self.entries.setdefault(entry["name"], {})[entry["key"]] = entry
+    def _keep(self, entries: Iterable[dict[str, Any]]) -> None:
+        for entry in entries:
+            self.entries.setdefault(entry["name"], {})[entry["key"]] = entry
 
 
 def _unseal(line: bytes) -> dict[str, Any] | None:
@@ -125,10 +114,7 @@ def file_digest(path: Path) -> str:
 
 
 def files_digest(folder: Path) -> str:
-    """One hash over the files that stand directly in a folder: what its frames share.
-
-    Hidden ones are left out, and the manifest, which lists the frames and so changes with each.
-    """
+    """One hash over the visible files directly in a folder but the manifest: what its frames share."""
     shared = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     paths = sorted(path for path in shared if path.name != "manifest.json")
     return digest_of({path.name: file_digest(path) for path in paths})
@@ -136,11 +122,7 @@ def files_digest(folder: Path) -> str:
 
 @functools.cache
 def source_digest(*modules: str) -> str:
-    """One hash over the code of modules of this package and of all that they import from it, directly or not.
-
-    What another version of that code made is not taken for what this one would make; changes elsewhere in the package,
-    comments and line breaks do not count.
-    """
+    """One hash over the code of modules of this package and of all that they import from it, directly or not."""
     found, new = set(), set(modules)
     while new:
         found |= new
@@ -158,10 +140,9 @@ def imported_modules(module: str) -> set[str]:
     """The modules of this package that one of them imports, inside its functions too, and the packages they are in."""
     names = set()
     for node in ast.walk(ast.parse(SOURCES[module])):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            base = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
+            names |= {f"{base}{alias.name}" for alias in node.names}
     return {part for name in names for part in accumulate(name.split("."), "{}.{}".format)} & SOURCES.keys()
 
 

@@ -25,9 +25,7 @@ report = logging.getLogger(__name__)
 def lock_file(file: IO[bytes], wait: bool = True) -> bool:
     """Locks an open file for this process until it is closed; gives False where the file system has no locks.
 
-    Raises:
-        BlockingIOError: when another process holds it and ``wait`` is False.
-        OSError: when the system refuses otherwise.
+    Raises `BlockingIOError` when another process holds it and ``wait`` is False, `OSError` for any other refusal.
     """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
@@ -42,12 +40,8 @@ def lock_file(file: IO[bytes], wait: bool = True) -> bool:
 def lock_folder(folder: Path, wait: bool = False) -> Iterator[None]:
     """Holds a run's folder for the length of a ``with`` block; the thread that holds it may enter again.
 
-    With ``wait`` a folder that another job holds is waited for, instead of refused. There are no stale locks: the
-    system lets go of them after ``kill -9``, too. The file says who holds it, for the message alone.
-
-    Raises:
-        AvatarError: when another job holds the folder, naming its process and machine.
-        DataError: when the lock cannot be written.
+    The system lets go of it after ``kill -9``, too; the file says who holds it, for the message alone. Raises
+    `AvatarError` naming the job that holds it unless it is to ``wait``; `DataError` when the lock cannot be written.
     """
     place = folder.resolve()
     if HELD.get(place) == threading.get_ident():

@@ -7,9 +7,10 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +21,21 @@ MEMBER_LIMIT = 200
 SWELLING = 100  # arrays of measured things deflate ten times at most; zeros, a thousand times
 SMALL = 16 << 20  # bytes unpacked that nobody needs to look at
 DTYPE_KINDS = {"float": "f", "int": "iu", "bool": "b", "text": "U", "number": "fiu"}
+STORED = {"float": np.float32, "int": np.int32, "bool": bool, "text": np.str_, "number": np.float64}
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError)  # what zipfile raises
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # one time stamp for all members, so that equal arrays give equal bytes
+
+
+@contextmanager
+def naming(path: Path, hint: str = "", prefix: str = "") -> Iterator[None]:
+    """Turns an `AvatarError` about what a file holds into a `DataError` that names the file, within a block."""
+    try:
+        yield
+    except DataError:
+        raise
+    except AvatarError as error:
+        raise DataError(path, f"{prefix}{error}", hint) from error
 
 
 def read_arrays(
@@ -34,20 +47,10 @@ def read_arrays(
 ) -> dict[str, np.ndarray]:
     """Reads named arrays of an npz file; other keys are never decoded, so what they hold does not matter.
 
-    A key is described by its kind and its shape, as in ``"float V 3"`` or ``"float V 3 3 | V 4 4"``: kinds
-    are float, int, bool, text, number, or an exact dtype such as uint8; a named size must be the same
-    wherever it stands. Member sizes and array headers are checked before anything is allocated.
-
-    Args:
-        path: the npz file.
-        required: key to description; all must be there.
-        optional: key to description; read where present.
-        limit: bytes that all arrays of the file may take unpacked.
-        version: what its text ``format`` must say, where it has one.
-
-    Raises:
-        DataError: naming file, key, what was expected and what came: missing or damaged file, oversized or
-            pickled members, missing keys, another format, wrong kinds or shapes, NaN or infinite numbers.
+    A key is described by its kind (float, int, bool, text, number or a dtype) and its shape, as in ``"float V 3"`` or
+    ``"float V 3 3 | V 4 4"``; a named size is the same wherever it stands. Sizes and headers are checked before
+    anything is allocated. Raises `DataError` naming file and key: damaged, more than ``limit`` bytes unpacked, pickled,
+    missing, another ``version`` in its ``format``, wrong kinds or shapes, NaN or infinite numbers.
     """
     path, optional = Path(path), optional or {}
     if not path.is_file():
@@ -86,44 +89,22 @@ def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipf
     return members
 
 
-def _read(
-    path: Path,
-    archive: zipfile.ZipFile,
-    info: zipfile.ZipInfo,
-    key: str,
-    description: str,
-    dims: dict[str, int],
-) -> np.ndarray:
-    """One member as an array; ``dims`` carries the named sizes from key to key."""
+def _read(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, key: str, description: str, dims: dict) -> Any:
+    """One member as an array; ``dims`` holds the named sizes from key to key."""
     kind, _, pattern = description.partition(" ")
     try:
         with archive.open(info) as stream:
-            shape, fortran, dtype = _read_header(path, key, stream)
-            start = stream.tell()
-            _check_header(path, key, shape, dtype, kind, info.file_size - start)
+            shape, fortran, dtype = READERS[np.lib.format.read_magic(stream)](stream)
+            _check_header(path, key, shape, dtype, kind, info.file_size - stream.tell())
             array = np.frombuffer(bytearray(stream.read()), dtype=dtype)
             array = array.reshape(shape, order="F" if fortran else "C")
-    except (KeyError, ValueError) as error:
-        if isinstance(error, DataError):
-            raise
+    except (*DAMAGED, DataError, MemoryError):
+        raise
+    except Exception as error:  # numpy takes an array's header for Python and may raise what Python does
         raise DataError(path, f"{key}: expected a plain array, it is not one ({error}).") from error
-    try:
-        dims.update(_match(key, array, pattern, dims))
-        if array.dtype.kind == "f":
-            check_finite(key, array)
-    except AvatarError as error:
-        raise DataError(path, str(error)) from error
+    with naming(path):
+        _match(key, array, pattern, dims)
     return array
-
-
-def _read_header(path: Path, key: str, stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order and type of an array, by numpy, which takes its header for Python and may raise what Python does."""
-    try:
-        return READERS[np.lib.format.read_magic(stream)](stream)
-    except DAMAGED:
-        raise  # `read_arrays` reports it
-    except Exception as error:
-        raise DataError(path, f"{key}: expected a plain array, its header is not one ({error}).") from error
 
 
 def _check_header(path: Path, key: str, shape: tuple, dtype: np.dtype, kind: str, stored: int) -> None:
@@ -137,28 +118,37 @@ def _check_header(path: Path, key: str, shape: tuple, dtype: np.dtype, kind: str
         raise DataError(path, f"{key}: its header declares {size} bytes of {shape}, the file holds {stored}.")
 
 
-def _match(key: str, array: np.ndarray, pattern: str, dims: dict[str, int]) -> dict[str, int]:
-    """Named sizes after the first of the patterns ``A | B`` that fits."""
-    choices = [choice.strip() for choice in pattern.split("|")]
-    for choice in choices:
-        try:
-            return check_shape(key, array, choice, **dims)
-        except AvatarError:
-            if choice == choices[-1]:
-                raise
-    return dims
+def _match(key: str, array: np.ndarray, pattern: str, dims: dict[str, int]) -> None:
+    """Adds the named sizes after the first of the patterns ``A | B`` that fits; refuses other shapes, NaN, infinity."""
+    *others, last = (choice.strip() for choice in pattern.split("|"))
+    for choice in others:
+        with suppress(AvatarError):
+            dims.update(check_shape(key, array, choice, **dims))
+            break
+    else:
+        dims.update(check_shape(key, array, last, **dims))
+    if array.dtype.kind == "f":
+        check_finite(key, array)
+
+
+def write_described(path: Path, version: str, described: Mapping[str, str], values: Mapping[str, Any], level=9) -> None:
+    """Writes what `read_arrays` reads with the same descriptions and ``version``; values that are None are left out.
+
+    Floats are stored as float32, whole numbers as int32. Raises `AvatarError` for other shapes, NaN or infinity.
+    """
+    arrays, dims = {"format": np.array(version)}, {}
+    for key, value in values.items():
+        if value is not None:
+            kind, _, pattern = described[key].partition(" ")
+            arrays[key] = np.asarray(value, STORED.get(kind, kind))
+            _match(key, arrays[key], pattern, dims)
+    write_arrays(path, arrays, level)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], level: int = 9) -> None:
     """Writes an npz file whole or not at all; equal arrays give equal bytes, so that files can be hashed.
 
-    Args:
-        path: where to, ending in .npz.
-        arrays: what to write, by name.
-        level: of deflating, from 1 (fast) to 9 (small).
-
-    Raises:
-        AvatarError: for an array of Python objects.
+    ``level`` of deflating: 1 (fast) to 9 (small). Raises `AvatarError` for an array of Python objects.
     """
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -177,30 +167,25 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], level: int = 9) -
 def write_whole(path: Path, data: bytes) -> None:
     """Writes a file atomically: a temporary file beside it, flushed, then renamed. Makes its folder.
 
-    Raises:
-        DataError: when the disk refuses, its cause the `OSError`; the file that was there before is there still.
+    Raises `DataError`, its cause the `OSError`, when the disk refuses; the file that was there before is there still.
     """
     path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _replace(path, data)
-    except OSError as error:
-        hint = "Make room and give the same command again."
-        raise DataError(path, f"could not be written ({error.strerror}; {len(data):,} bytes).", hint) from error
-
-
-def _replace(path: Path, data: bytes) -> None:
     part = path.with_name(f".{path.name}.tmp-{os.getpid()}")
     try:
-        with part.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with part.open("wb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        hint = "Free disk space and give the same command again."
+        raise DataError(path, f"could not be written ({error.strerror}; {len(data):,} bytes).", hint) from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,29 +26,11 @@ SCALARS = {
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 
-@dataclass(frozen=True)
-class PlyHeader:
-    """What a PLY header promises of its vertices.
-
-    ``byte_order`` is ``<``, ``>`` or empty for ASCII; ``count`` vertices, each of ``properties`` (name, numpy
-    scalar code), stand ``start`` bytes into the file.
-    """
-
-    byte_order: str
-    count: int
-    properties: tuple[tuple[str, str], ...]
-    start: int
-
-
 def write_points(path: str | Path, cloud: PointCloud) -> None:
-    """Writes a cloud as binary little-endian PLY, float32 ``x y z nx ny nz``, metres, and uchar ``red green blue``.
+    """Writes a cloud as binary little-endian PLY, whole or not at all: float32 ``x y z nx ny nz``, uchar colours.
 
-    Colours are written where the cloud has them, 8 bits a channel. Equal clouds give equal bytes. The file appears
-    whole or not at all.
-
-    Raises:
-        AvatarError: on wrong shapes, no points, non-finite values or colours beyond [0, 1].
-        DataError: when the file name does not end in .ply.
+    Equal clouds give equal bytes. Raises `AvatarError` on wrong shapes, non-finite values or colours beyond [0, 1],
+    `DataError` for no points or another ending.
     """
     path = Path(path)
     check_suffix(path, (".ply",), "a file name")
@@ -78,11 +59,7 @@ def color_bytes(colors: np.ndarray) -> np.ndarray:
 
 
 def unit_colors(path: Path, colors: np.ndarray, whole: bool) -> np.ndarray:
-    """A file's colours as float32 in [0, 1]: whole numbers are 0 to 255, floats are in [0, 1] already.
-
-    Raises:
-        DataError: for values beyond that range.
-    """
+    """A file's colours as float32 in [0, 1], of whole numbers to 255 or of floats; `DataError` beyond them."""
     highest = 255 if whole else 1
     if colors.size and not 0 <= colors.min() <= colors.max() <= highest:
         problem = f"expected colours from 0 to {highest}, got {colors.min():.4g} to {colors.max():.4g}."
@@ -91,22 +68,27 @@ def unit_colors(path: Path, colors: np.ndarray, whole: bool) -> np.ndarray:
 
 
 def read_points(path: str | Path) -> PointCloud:
-    """Reads an oriented point cloud from a PLY file: float32 points, unit normals and, where it has them, colours.
+    """Reads a PLY of any scalar kind: float32 points, unit normals and, where it has them, colours in [0, 1].
 
-    Foreign files are welcome: ASCII or binary, further properties and elements are ignored. Normals a little off
-    unit length are renormalised. Colours are ``red green blue`` as uchar, or as floats in [0, 1].
-
-    Raises:
-        DataError: naming the file and what is wrong with it: missing, another format, damaged, empty, too large,
-            no normals, non-finite values, normals far from unit length, or colours beyond their range.
+    Further properties and elements are ignored, normals a little off unit length renormalised. Raises `DataError`
+    naming the file and what is wrong: damaged, empty, too large, no normals, non-finite values, colours beyond their
+    range.
     """
     path = Path(path)
     check_suffix(path, (".ply",), "a file name")
     check_file(path, MAX_BYTES)
     data = path.read_bytes()
-    header = read_ply_header(path, data)
-    columns = _wanted_columns(path, header)
-    values = _read_columns(path, data, header, columns)
+    row, count, rest, binary = _read_header(path, data)
+    missing = [name for name in COLUMNS if name not in row.names]
+    if missing:
+        problem = f"expected the vertex properties {' '.join(COLUMNS)}, {' '.join(missing)} missing."
+        hint = "Estimate oriented normals first (MeshLab: Compute normals for point sets)."
+        raise DataError(path, problem, hint)
+    if not count:
+        raise DataError(path, "expected at least one point, got an empty cloud.")
+    colored = set(COLORS) <= set(row.names)
+    read = _read_binary if binary else _read_ascii
+    values = read(path, rest, row, count, COLUMNS + COLORS if colored else COLUMNS)
     if not np.isfinite(values).all():
         bad = int((~np.isfinite(values)).any(axis=1).sum())
         raise DataError(path, f"{bad} of {len(values)} points are NaN or infinite.", "Remove them and try again.")
@@ -117,18 +99,19 @@ def read_points(path: str | Path) -> PointCloud:
         worst = float(lengths[off.argmax(), 0])
         raise DataError(path, f"expected unit normals, got one of length {worst:.4g}.", "Normalise them first.")
     normals = np.where(off > EXACT_LENGTH, normals / lengths, normals)
-    whole = dict(header.properties).get("red", "f4")[0] in "iu"
-    found = unit_colors(path, colors, whole) if len(columns) > len(COLUMNS) else None
+    found = unit_colors(path, colors, row["red"].kind in "iu") if colored else None
     return PointCloud(points.astype(np.float32), normals.astype(np.float32), found)
 
 
-def read_ply_header(path: Path, data: bytes) -> PlyHeader:
-    """The vertex part of a PLY header, checked against the size of the file before anything is allocated."""
+def _read_header(path: Path, data: bytes) -> tuple[np.dtype, int, memoryview, bool]:
+    """What a PLY header promises: a vertex's properties, their number, the bytes after it, and whether they are binary.
+
+    The number is checked against the size of the file before anything is allocated.
+    """
     end = re.search(rb"end_header[ \t]*\r?\n", data[:MAX_HEADER])
     if not data.startswith(b"ply") or end is None:
         raise DataError(path, "expected a PLY file with a header, got something else.")
-    byte_order, count, properties = None, None, []
-    element = ""
+    byte_order, count, properties, element = None, None, [], ""
     for line in data[: end.start()].decode("latin-1").splitlines()[1:]:
         match line.split():
             case ["format", kind, *_] if kind in BYTE_ORDERS:
@@ -145,47 +128,27 @@ def read_ply_header(path: Path, data: bytes) -> PlyHeader:
                 raise DataError(path, f"the header line {line.strip()!r} is not a scalar vertex property.")
     if byte_order is None or count is None:
         raise DataError(path, "the header lacks a known format or a vertex element.")
-    if len({name for name, _ in properties}) != len(properties):
+    if len(dict(properties)) != len(properties):
         raise DataError(path, "the header names a vertex property twice.")
     if count > min(MAX_POINTS, len(data)):
         raise DataError(path, f"the header promises {count} vertices, more than the file or the limit can hold.")
-    return PlyHeader(byte_order, count, tuple(properties), end.end())
+    row = np.dtype([(name, byte_order + code) for name, code in properties])
+    return row, count, memoryview(data)[end.end() :], bool(byte_order)
 
 
-def _wanted_columns(path: Path, header: PlyHeader) -> tuple[str, ...]:
-    """The properties to read: positions, normals, and colours where all three are there."""
-    names = [name for name, _ in header.properties]
-    missing = [name for name in COLUMNS if name not in names]
-    if missing:
-        raise DataError(
-            path,
-            f"expected the vertex properties {' '.join(COLUMNS)}, {' '.join(missing)} missing.",
-            "Estimate oriented normals first (MeshLab: Compute normals for point sets).",
-        )
-    return COLUMNS + COLORS if set(COLORS) <= set(names) else COLUMNS
-
-
-def _read_columns(path: Path, data: bytes, header: PlyHeader, columns: tuple[str, ...]) -> np.ndarray:
-    """Some properties as ``(N, C)`` float64."""
-    if not header.count:
-        raise DataError(path, "expected at least one point, got an empty cloud.")
-    if not header.byte_order:
-        names = [name for name, _ in header.properties]
-        return _read_ascii(path, data, header, [names.index(name) for name in columns])
-    row = np.dtype([(name, header.byte_order + code) for name, code in header.properties])
-    if header.start + header.count * row.itemsize > len(data):
-        held = (len(data) - header.start) // row.itemsize
-        raise DataError(path, f"cut short: the header promises {header.count} vertices, the file holds {held}.")
-    rows = np.frombuffer(data, row, header.count, header.start)
+def _read_binary(path: Path, data: memoryview, row: np.dtype, count: int, columns: tuple[str, ...]) -> np.ndarray:
+    if count * row.itemsize > len(data):
+        held = len(data) // row.itemsize
+        raise DataError(path, f"cut short: the header promises {count} vertices, the file holds {held}.")
+    rows = np.frombuffer(data, row, count)
     return np.stack([rows[name].astype(np.float64) for name in columns], axis=1)
 
 
-def _read_ascii(path: Path, data: bytes, header: PlyHeader, columns: list[int]) -> np.ndarray:
-    """The same from the lines of an ASCII file."""
-    lines = [line for line in data[header.start :].decode("latin-1").splitlines() if line.strip()][: header.count]
-    if len(lines) < header.count:
-        raise DataError(path, f"cut short: the header promises {header.count} vertices, got {len(lines)} lines.")
+def _read_ascii(path: Path, data: memoryview, row: np.dtype, count: int, columns: tuple[str, ...]) -> np.ndarray:
+    lines = [line for line in str(data, "latin-1").splitlines() if line.strip()][:count]
+    if len(lines) < count:
+        raise DataError(path, f"cut short: the header promises {count} vertices, got {len(lines)} lines.")
     try:
-        return np.loadtxt(lines, usecols=columns, ndmin=2, comments=None)
+        return np.loadtxt(lines, usecols=[row.names.index(name) for name in columns], ndmin=2, comments=None)
     except ValueError as error:
         raise DataError(path, f"a vertex line cannot be read ({error}).") from error

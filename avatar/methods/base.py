@@ -1,7 +1,4 @@
-"""Interface of a method of any kind (points, implicit surface, mesh): one file in this folder, with a `Method` in it.
-
-Trainer, prediction, meshing, evaluation and reports know this interface and no method by name.
-"""
+"""Interface of a method of any kind, one file in this folder each; the rest of the program knows no method by name."""
 
 from __future__ import annotations
 
@@ -24,10 +21,9 @@ CANONICALIZER = "canonicalizer"  # a method's need: a trained canonicalizer for 
 
 @dataclass(frozen=True)
 class Stage:
-    """Part of training with its own learning rates; it begins with a fresh optimiser state.
+    """Part of training, a ``share`` of the budget, that begins with a fresh optimiser state.
 
-    ``share`` of the budget; ``rates``, one for each of the task's parameter groups; ``factor(step, progress)`` on all
-    of them, at a step of the run and a share of the stage.
+    It has ``rates``, one for each parameter group of the task, with a ``factor(step of the run, share of the stage)``.
     """
 
     share: float
@@ -127,10 +123,7 @@ class Method(ABC):
         return (type(self).__module__,)
 
     def check(self, run: RunConfig, settings: Any) -> None:  # noqa: B027 (nothing to check by default)
-        """Check a run before its data are read.
-
-        Raises `AvatarError` for a run that the method cannot train, such as several outfits where it takes one.
-        """
+        """Raises `AvatarError`, before data are read, for a run that the method cannot train."""
 
     def needs(self, run: RunConfig, settings: Any) -> frozenset[str]:
         """What must be made of the outfits before training: any of {`CANONICALIZER`}."""
@@ -138,10 +131,7 @@ class Method(ABC):
 
     @abstractmethod
     def prepare(self, run: RunConfig, settings: Any, template: Template) -> Task:
-        """An untrained network with its data and loss, on the run's device.
-
-        Raises `DataError` when something the method needs is missing, naming the command that makes it.
-        """
+        """An untrained network with its data and loss, on the run's device; `DataError` where something is missing."""
 
     @abstractmethod
     def untrained(self, settings: Any, template: Template) -> nn.Module:
@@ -157,9 +147,9 @@ class Method(ABC):
 
     @abstractmethod
     def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
-        """A function from a `BodyFit` to its dressed `Surface`, in one of the avatar's outfits.
+        """A function from a `BodyFit` to its dressed `Surface` in an outfit, of 1,000 to 400,000 ``points``.
 
-        ``points`` a frame are 1,000 to 400,000; ``surface`` is the resolution of an implicit surface.
+        ``surface`` is the resolution of an implicit surface.
         """
 
     def prediction_settings(self, points: int, surface: ExtractionConfig) -> dict[str, Any]:
@@ -167,10 +157,7 @@ class Method(ABC):
         return {"points": points}
 
     def predict_at(self, avatar: TrainedAvatar, outfit: str, body: BodyFit, samples: SurfaceSamples) -> PointCloud:
-        """The dressed surface at chosen places of the body (``on_body`` methods).
-
-        Raises `AvatarError` for a method that has no points there.
-        """
+        """The dressed surface at chosen places of the body; `AvatarError` for a method that has no points there."""
         raise AvatarError(f"method: expected one with points at chosen places of the body, got {self.name}.")
 
     def garment(
@@ -180,9 +167,6 @@ class Method(ABC):
         return None
 
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
-        """The garment code of an unseen outfit from one scan, for a method with one code an outfit.
-
-        Raises `AvatarError` for a method without codes.
-        """
+        """The garment code of an unseen outfit from one scan; `AvatarError` for a method without codes."""
         problem = f"run: expected a method with a garment code for each outfit, got {self.name}."
         raise AvatarError(f"{problem} Hint: train the new outfit by itself.")

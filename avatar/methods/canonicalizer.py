@@ -13,29 +13,24 @@ import torch
 from torch import Tensor, nn
 
 from avatar.body.packed import read_template
-from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
-from avatar.canonical.fields import SkinningField, bounding_box
-from avatar.canonical.losses import TERMS, CanonicalLossConfig, NearestWeights, canonicalization_loss
-from avatar.canonical.posed import DrawConfig, PosedScan, ScanBatch, draw_batch, prepare_scan, to_root_frame
-from avatar.canonical.scans import STRETCH
-from avatar.checks import AvatarError, DataError, check_name
+from avatar.canonical.canonicalizer import TERMS, Canonicalizer, CanonicalizerConfig, CanonicalLossConfig, cycle_loss
+from avatar.canonical.fields import BodyField, SkinningField, bounding_box
+from avatar.canonical.scans import STRETCH, DrawConfig, PosedScan, ScanBatch, draw_batch, prepare_scan, to_root_frame
+from avatar.checks import DataError, check_name, check_range
 from avatar.data.batches import FrameDataset, name_frames
-from avatar.data.canonical_frames import CanonicalOutfit
-from avatar.data.layouts import find_outfit
+from avatar.data.layouts import CanonicalOutfit, find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import SCANNERS, ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.geometry.chunks import in_chunks
-from avatar.implicit.fields import BodyField
-from avatar.invocation import command_line
+from avatar.invocation import command_line, option
 from avatar.io.checkpoints import building, read_weights
 from avatar.io.documents import read_yaml
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Stage, Task
-from avatar.methods.settings import CANONICALIZERS
-from avatar.records import Frame, LossTerms, Template
+from avatar.methods.settings import CANONICALIZERS, Clock
+from avatar.records import Frame, LossTerms, Template, map_tensors
 from avatar.settings import settings_from_dict
-from avatar.values import option
 
 WEIGHTS = "canonicalizer"  # canonicalizer.safetensors and canonicalizer.json in the run's folder
 CHUNK = 20_000  # points queried at once, or fewer where memory runs out
@@ -50,7 +45,8 @@ class CycleConfig:
 
     first_steps: int = 10_000  # optimiser steps with the fields apart
     second_steps: int = 25_000  # and together
-    minutes: float | None = None  # wall-clock budget; training ends at whichever comes first, stages keep their shares
+    minutes: float | None = None  # budget of time; training ends at whichever comes first, stages keep their shares
+    clock: Clock = Clock.wall  # that minutes are read from
     batch: int = 4  # frames a step
     first_lr: float = 0.004
     second_lr: float = 0.001
@@ -65,16 +61,10 @@ class CycleConfig:
     seed: int = 0
 
     def __post_init__(self):
-        for name in ("first_steps", "batch", "code_steps", "save_every", "log_every"):
-            if getattr(self, name) < 1:
-                raise AvatarError(f"{name}: expected at least 1, got {getattr(self, name)}.")
-        if self.second_steps < 0 or (self.clip is not None and self.clip <= 0):
-            problem = f"second_steps: expected at least 0, clip: above 0; got {self.second_steps}, {self.clip}."
-            raise AvatarError(problem)
-        if self.minutes is not None and self.minutes <= 0:
-            raise AvatarError(f"minutes: expected above 0 or null, got {self.minutes}.")
-        if min(self.first_lr, self.second_lr, self.code_lr) <= 0 or not 0 < self.decay <= 1:
-            raise AvatarError("first_lr, second_lr, code_lr: expected above 0, decay: in (0, 1].")
+        check_range(self, "first_steps", "batch", "code_steps", "save_every", "log_every", low=1)
+        check_range(self, "second_steps", low=0)
+        check_range(self, "minutes", "first_lr", "second_lr", "clip", "code_lr", above=0)
+        check_range(self, "decay", above=0, high=1)
 
     @property
     def validate_every(self) -> int:
@@ -97,26 +87,17 @@ class CanonicalizerTask(Task):
     terms = TERMS
     label = "canonicalizer"
 
-    def __init__(
-        self,
-        model: Canonicalizer,
-        template: Template,
-        scans: Sequence[PosedScan],
-        names: Sequence[str],
-        config: CycleConfig,
-    ):
-        """Prepares training of a canonicalizer on its scans; ``names`` are theirs, for messages."""
+    def __init__(self, model: Canonicalizer, template: Template, scans: Sequence, names: Sequence, config: CycleConfig):
+        """Prepares training of a canonicalizer on its `PosedScan`s; ``names`` are theirs, for messages."""
         self.model, self.config, self.scans, self.names = model, config, scans, names
-        self.nearest = NearestWeights(template, next(model.parameters()).device)
-        self.weights = template.weights
-        self.frames, self.batch = len(scans), config.batch
+        self.nearest = BodyField(template, 1).to(next(model.parameters()).device)
+        self.weights, self.frames, self.batch = template.weights, len(scans), config.batch
         self.groups = (list(model.parameters()),)
         plan = ((config.first_steps, config.first_lr), (config.second_steps, config.second_lr))
         self.stages = tuple(Stage(steps / config.steps, (rate,), config.rate_factor) for steps, rate in plan if steps)
 
     def inputs_at(self, step: int) -> tuple[ScanBatch]:
-        places = torch.arange(step * self.config.batch, (step + 1) * self.config.batch)
-        frames = [self.frame_at(int(place)) for place in places]
+        frames = [self.frame_at(place) for place in range(step * self.batch, (step + 1) * self.batch)]
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + step)
         return (draw_batch(self.scans, frames, self.weights, self.config.draw, generator),)
 
@@ -131,7 +112,7 @@ class CanonicalizerTask(Task):
         (batch,), together = inputs, position.stage > 0
         cycle = self.model(batch, self.model.batch_codes(batch), together=together)
         progress = position.progress if together else 0.0
-        return canonicalization_loss(cycle, batch, self.nearest, self.config.loss, progress)
+        return cycle_loss(cycle, batch, self.nearest, self.config.loss, progress)
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:
         return super().shown(values) | {"cycle": f"{1e3 * values.get('cycle_points', 0):.1f}mm"}
@@ -141,21 +122,19 @@ class CanonicalizerTask(Task):
 
 
 def fit_latent(model: Canonicalizer, template: Template, scan: PosedScan, start: Tensor, config: CycleConfig) -> Tensor:
-    """Fits the code ``(L,)`` of a frame that was not trained on, with frozen networks (auto-decoding).
-
-    ``start (L,)`` is the code of a learned frame in a similar pose; ``template`` the body at rest.
-    """
-    if model.config.latent is Latent.pose:
+    """Fits the code ``(L,)`` of a frame that was not trained on, from that of a similar pose, with frozen networks."""
+    if not model.coded:
         return scan.pose.to(start)
     code = start.detach().clone().requires_grad_()
-    nearest, weights = NearestWeights(template, code.device), template.weights.cpu()
+    nearest = BodyField(template, 1).to(code.device)
     optimiser = torch.optim.Adam([code], lr=config.code_lr)
     for step in range(config.code_steps):
         optimiser.param_groups[0]["lr"] = config.code_lr * config.rate_factor(step, step / config.code_steps)
         generator = torch.Generator().manual_seed(config.seed * SEED_STRIDE + step)
-        batch = draw_batch([scan], [0], weights, config.draw, generator).to(code.device)
+        batch = draw_batch([scan], [0], template.weights.cpu(), config.draw, generator)
+        batch = map_tensors(batch, lambda tensor: tensor.to(code.device))
         cycle = model(batch, code[None], together=True)
-        loss = canonicalization_loss(cycle, batch, nearest, config.loss, step / config.code_steps).total
+        loss = cycle_loss(cycle, batch, nearest, config.loss, step / config.code_steps).total
         (code.grad,) = torch.autograd.grad(loss, [code])
         optimiser.step()
     return code.detach()
@@ -191,23 +170,17 @@ class CanonicalizeConfig:
     def __post_init__(self):
         for what in ("name", "dataset", "outfit"):
             check_name(what, getattr(self, what))
-        if self.stretch <= 1:
-            raise AvatarError(f"stretch: expected above 1, got {self.stretch}.")
-        if min(self.pictures, self.scored) < 0:
-            raise AvatarError(f"pictures, scored: expected at least 0, got {self.pictures} and {self.scored}.")
+        check_range(self, "stretch", above=1)
+        check_range(self, "pictures", "scored", low=0)
 
     @property
     def folder(self) -> Path:
         """Where the run lives: ``<runs>/canonical/<dataset>/<outfit>/<name>``."""
         return self.runs_root / CANONICALIZERS / self.dataset / self.outfit / self.name
 
-    def find_outfit(self) -> Outfit:
-        """The outfit on disk."""
-        return find_outfit(self.data_root, self.dataset, self.outfit, self.scan)
-
     def frames(self) -> FrameDataset:
         """The frames that are canonicalized: first those of training, which are learned from, then those of test."""
-        outfit = self.find_outfit()
+        outfit = find_outfit(self.data_root, self.dataset, self.outfit, self.scan)
         names = name_frames([outfit], "train", [split_outfit(outfit, self.split).train])
         if outfit.has_frames("test"):
             names += name_frames([outfit], "test", [outfit.frames("test")])
@@ -239,14 +212,14 @@ class TrainedCanonicalizer:
         """The code ``(L,)`` of a frame: the learned one, or found for its scan where it was not learned from."""
         codes = self.model.codes.detach()
         learned = frame.split == "train" and frame.outfit == self.config.outfit and frame.name in self.frames
-        if learned and self.model.config.latent is Latent.auto_decoded:
+        if learned and self.model.coded:
             return codes[self.frames.index(frame.name)]
         scan = prepare_scan(frame, self.template, self.config.train.draw.pool)
         alike = (self.poses - scan.joint_transforms).square().sum(dim=(1, 2, 3)).argmin()
         return fit_latent(self.model, self.template, scan, codes[alike], self.config.train)
 
     def weights_of(self, points: np.ndarray, frame: Frame) -> np.ndarray:
-        """Weights ``(M, J)`` of posed points ``(M, 3)`` in the frame's world, metres (see `SkinningSource`)."""
+        """Weights ``(M, J)`` of posed points ``(M, 3)`` in the frame's world, metres."""
         code = self.code_of(frame)[None]
         box = bounding_box(to_root_frame(frame.body.vertices, frame.body))[None].to(code.device)
         places = to_root_frame(points, frame.body).to(code.device)
@@ -255,11 +228,11 @@ class TrainedCanonicalizer:
         return torch.cat(parts).cpu().numpy()
 
 
-def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicalizer:
-    """The trained canonicalizer of a run's folder.
+SkinningSource = TrainedCanonicalizer | BodyField  # what gives posed points their weights, by `weights_of`
 
-    Raises `DataError` when the folder is no finished run of learned weights, or a file in it is damaged.
-    """
+
+def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicalizer:
+    """The canonicalizer of a finished run of learned weights; `DataError` where it is missing or damaged."""
     if not (folder / f"{WEIGHTS}.json").is_file():
         hint = "Canonicalize the outfit first (tools/canonicalize.py) with weights=learned."
         raise DataError(folder, "no trained canonicalizer here.", hint)
@@ -276,8 +249,7 @@ def load_canonicalizer(folder: Path, device: str = "auto") -> TrainedCanonicaliz
 def find_field(folder: Path, template: Template) -> nn.Module:
     """The forward skinning field of a checked run: the learned one, or the body's for its baselines (nearest, knn).
 
-    Both are posed by the six nearest body vertices, for with the nearest one alone the posed surface would tear
-    wherever the neighbour changes.
+    Both take the six nearest vertices: with one alone the posed surface would tear wherever the neighbour changes.
     """
     path = folder / "config.yaml"
     if settings_from_dict(CanonicalizeConfig, read_yaml(path), f"{path}: ").weights is WeightSource.learned:
@@ -286,10 +258,7 @@ def find_field(folder: Path, template: Template) -> nn.Module:
 
 
 def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
-    """The folder of an outfit's canonicalizer, ``<runs>/canonical/<dataset>/<outfit>/<name>``, after a check.
-
-    Raises `DataError` with the command that makes it, when it is not there or was made for another body.
-    """
+    """The folder of an outfit's canonicalizer; `DataError` with the command that makes it, if missing or another's."""
     folder = runs_root / CANONICALIZERS / outfit.dataset / outfit.name / name
     where = [f"dataset={outfit.dataset}", f"outfit={outfit.name}", f"name={name}"]
     where += [] if runs_root == Path("runs") else [option("runs_root", runs_root)]
@@ -311,10 +280,7 @@ def canonicalizer_folder(runs_root: Path, outfit: Outfit, name: str) -> Path:
 
 
 def canonical_outfits(runs_root: Path, outfits: list[Outfit], name: str) -> list[Outfit]:
-    """The outfits in canonical space: scans of their canonicalizers' runs in place of the posed ones.
-
-    Raises `DataError` when a training frame's scan has not been canonicalized.
-    """
+    """The outfits with their canonicalizers' scans; `DataError` when a training frame's has not been canonicalized."""
     resting = []
     for outfit in outfits:
         scans = canonicalizer_folder(runs_root, outfit, name) / "scans"

@@ -32,6 +32,7 @@ FULL_GARMENT_ENCODER = {
     "abstraction": ((32, 32, 32), (32, 32, 64), (64, 64, 64), (64, 64, 128), (128, 128, 128), (128, 128, 128)),
     "propagation": ((128, 128), (128, 64), (64, 64), (64, 64), (64, 64), (64, 64)),
 }
+FREE_RATE = 4.0  # units of a decoder's output that one of a free offset stands for, beside codes learned at one rate
 
 
 class Skinning(Enum):
@@ -58,10 +59,14 @@ class ClosetConfig:
     pose_decoder: DecoderConfig = field(default_factory=DecoderConfig)
     code_channels: int = 64  # width of the learned garment code on each template vertex
     code_std: float = 0.01  # standard deviation of a fresh garment code
+    code_skip: bool = False  # the decoders see the garment code itself beside its features (ours)
+    free_offsets: bool = False  # an offset of each vertex, learned beside the code, is added to the template's (ours)
     offset_scale: float = 0.02  # metres one unit of a decoder's output stands for (POP)
     template: bool = True  # explicit template decomposition (CloSET 3.2); False is the CSF ablation
     pose: bool = True  # the pose branch; False is the `static` floor: a garment template skinned by the body
     pose_noise: float = 0.0  # metres; noise on the pose encoder's input in training
+    relative: bool = True  # the pose encoder's first abstraction sees how features differ from a group's centre as well
+    rest_vertices: bool = True  # the pose encoder sees the template's vertices as features beside the posed ones
     pose_locality: PoseLocality = PoseLocality.whole
     local_encoder: LocalPoseConfig = field(default_factory=LocalPoseConfig)  # instead of pose_encoder when kinematic
     skinning: Skinning = Skinning.body
@@ -72,6 +77,8 @@ class ClosetConfig:
     def __post_init__(self):
         if not (self.template or self.pose):
             raise AvatarError("template, pose: expected at least one branch, got neither.")
+        if self.free_offsets and not self.template:
+            raise AvatarError("free_offsets: they are part of the explicit template; set template=true.")
         if self.pose_noise and self.pose_locality is PoseLocality.kinematic:
             raise AvatarError("pose_noise: it is for the global pose encoder; set it to 0 with kinematic locality.")
         if self.train_field and self.skinning is Skinning.body:
@@ -93,17 +100,20 @@ class ClosetAvatar(TemplateNetwork):
         super().__init__(template, config)
         self.skinning: LearnedSkinning | None = None
         codes = torch.randn(outfits, len(template.vertices), config.code_channels) * config.code_std
+        if config.free_offsets:
+            codes = torch.cat([codes, torch.zeros_like(codes[..., :3])], dim=-1)
         self.codes = nn.Parameter(codes)
         encoder = ENCODERS[config.encoder]
         self.garment_encoder = encoder(template, config.code_channels, config.garment_encoder)
-        channels = self.garment_encoder.out_channels + 3
+        channels = self.garment_encoder.out_channels + 3 + (config.code_channels if config.code_skip else 0)
         if config.template:
             self.garment_decoder = ShapeDecoder(channels, config.garment_decoder)
         if config.pose:
             if config.pose_locality is PoseLocality.kinematic:
                 self.pose_encoder = LocalPoseEncoder(template, config.local_encoder)
             else:
-                self.pose_encoder = encoder(template, 3, config.pose_encoder)
+                channels_in = 6 if config.rest_vertices else 3
+                self.pose_encoder = encoder(template, channels_in, config.pose_encoder, config.relative)
             self.pose_decoder = ShapeDecoder(channels + self.pose_encoder.out_channels, config.pose_decoder)
 
     def skin_with(self, skinning: LearnedSkinning) -> None:
@@ -120,7 +130,17 @@ class ClosetAvatar(TemplateNetwork):
 
     def garment_features(self, codes: Tensor, samples: SurfaceSamples) -> Tensor:
         """Garment features of each sample: ``(O, V, C)`` codes to ``(O, N, C')``."""
-        return interpolate(self.garment_encoder(codes), samples)
+        codes = codes[..., : self.config.code_channels]
+        features = self.garment_encoder(codes)
+        return interpolate(torch.cat([features, codes], dim=-1) if self.config.code_skip else features, samples)
+
+    def decode_garment(self, codes: Tensor, garment: Tensor, places: Tensor, samples: SurfaceSamples) -> Decoded:
+        """As `TemplateNetwork.decode_garment`, with the free offsets added where there are some."""
+        decoded = super().decode_garment(codes, garment, places, samples)
+        if not self.config.free_offsets:
+            return decoded
+        free = interpolate(codes[..., self.config.code_channels :], samples) * FREE_RATE
+        return Decoded(decoded.offsets + free, decoded.normals)
 
     def pose_features(self, batch: Batch, samples: SurfaceSamples) -> Tensor:
         """Features ``(B, N, C)`` of each sample, of its frame's whole pose or of the joints near it."""
@@ -129,6 +149,8 @@ class ClosetAvatar(TemplateNetwork):
         pose_vertices = batch.pose_vertices
         if self.training and self.config.pose_noise:
             pose_vertices = pose_vertices + torch.randn_like(pose_vertices) * self.config.pose_noise
+        if self.config.rest_vertices:
+            pose_vertices = torch.cat([pose_vertices, self.vertices.expand_as(pose_vertices)], dim=-1)
         return interpolate(self.pose_encoder(pose_vertices), samples)
 
     def pose_points(self, local: Decoded, batch: Batch, samples: SurfaceSamples) -> Prediction:
@@ -171,6 +193,10 @@ class Closet(PointMethod):
         return {"fields": [settings_to_dict(skin.config) for skin in model.skinning.fields]}
 
     def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> ClosetAvatar:
+        encoder = facts["config"]["method"]["settings"].get("garment_encoder", {})
+        if "spread" not in encoder.get("hierarchy", {}):  # groups are no part of the weights
+            problem = "expected in the settings of trained weights, got none: they are of an earlier version"
+            raise AvatarError(f"garment_encoder.hierarchy.spread: {problem}. Hint: train the run again.")
         model = super().rebuild(settings, template, outfits, facts, weights)
         if settings.skinning is Skinning.learned:
             box = torch.tensor([[-1.0], [1.0]]).expand(2, 3)  # the fields' sizes alone matter: their state is loaded

@@ -8,8 +8,7 @@ from enum import Enum
 from torch import Tensor
 
 from avatar.checks import AvatarError
-from avatar.geometry.distances import normal_difference, point_to_plane, point_to_point
-from avatar.geometry.neighbours import correspond
+from avatar.geometry.neighbours import correspond, normal_difference, point_to_plane, point_to_point
 from avatar.geometry.sparse import gather_rows
 from avatar.records import Batch, LossTerms, Prediction
 

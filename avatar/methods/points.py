@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
-from avatar.data.batches import FrameDataset, name_frames
-from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
+from avatar.data.batches import FrameDataset, mirror_batch, mirror_coins, mirror_map, name_frames
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.environment import choose_device

@@ -5,24 +5,16 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
-from collections.abc import Iterator
 
 from avatar import methods
 from avatar.checks import unknown_name
 from avatar.methods.base import Method
 
-
-def defined_methods() -> Iterator[Method]:
-    """One of each class of methods that has a name, in the order of their files."""
-    for found in pkgutil.iter_modules(methods.__path__, f"{methods.__name__}."):
-        if found.name != __name__:
-            for kind in vars(importlib.import_module(found.name)).values():
-                named = inspect.isclass(kind) and issubclass(kind, Method) and hasattr(kind, "name")
-                if named and kind.__module__ == found.name:
-                    yield kind()
-
-
-METHODS = {method.name: method for method in defined_methods()}
+METHODS: dict[str, Method] = {}  # in the order of their files
+for found in pkgutil.iter_modules(methods.__path__, f"{methods.__name__}."):
+    for kind in vars(importlib.import_module(found.name)).values() if found.name != __name__ else ():
+        if inspect.isclass(kind) and issubclass(kind, Method) and hasattr(kind, "name"):
+            METHODS.setdefault(kind.name, kind())
 
 
 def find_method(name: str) -> Method:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize, pad
 
-from avatar.checks import AvatarError, check_shape
+from avatar.checks import AvatarError, check_range, check_shape
 from avatar.geometry.neighbours import nearest
 from avatar.geometry.sparse import SparseRows, gather_sum
 from avatar.geometry.surface import farthest_points, interpolate
@@ -59,8 +60,7 @@ class ScaleConfig:
     normals: Normals = Normals.body  # of a patch's triangle, which the decoder corrects; free as in the paper
 
     def __post_init__(self):
-        if self.patches < 1:
-            raise AvatarError(f"patches: expected at least 1, got {self.patches}.")
+        check_range(self, "patches", low=1)
         self.pose_encoder.check_map_size(self.map_size)
 
 
@@ -70,11 +70,9 @@ class PointNet(nn.Module):
     def __init__(self, out_channels: int, config: PointNetConfig):
         super().__init__()
         self.points = point_mlp((3, *config.points), WideLinear)
-        layers, fan_in = [], config.points[-1]
-        for width in config.body:  # no normalisation here: a batch of one body has nothing to normalise over
-            layers += [nn.Linear(fan_in, width), nn.ReLU()]
-            fan_in = width
-        self.body = nn.Sequential(*layers, nn.Linear(fan_in, out_channels))
+        sizes = pairwise((config.points[-1], *config.body, out_channels))
+        layers = [layer for size in sizes for layer in (nn.Linear(*size), nn.ReLU())]
+        self.body = nn.Sequential(*layers[:-1])  # no normalisation: a batch of one body has nothing to normalise over
 
     def forward(self, points: Tensor) -> Tensor:
         """``(B, N, 3)`` to ``(B, C)``."""
@@ -84,36 +82,24 @@ class PointNet(nn.Module):
 class ScaleAvatar(nn.Module):
     """The SCALE network of one outfit: patches fixed to triangles of the posed body.
 
-    A patch belongs to a pixel of the position map: it has that pixel's feature, its place on the body and the frame of
-    the triangle there. Its points differ by patch coordinates alone, the cell of the pixel that a point stands for. A
-    point of the body that lies in no patch's pixel belongs to the patch nearest in the atlas.
+    A patch has the feature of a pixel of the position map, its place on the body and its triangle's frame; points of it
+    differ by their cell of the pixel alone. A point in no patch's pixel belongs to the patch nearest in the atlas.
     """
 
     def __init__(self, template: Template, outfits: int, config: ScaleConfig):
-        """Builds the network on a body template with UV coordinates.
-
-        Raises `AvatarError` for more than one outfit, which SCALE has no code for.
-        """
+        """Builds the network on a body with UV coordinates; `AvatarError` for several outfits, which have no codes."""
         super().__init__()
         if outfits != 1:
             raise AvatarError(f"outfit: SCALE models one outfit, got {outfits}; train a run for each.")
-        self.config, self.vertex_count = config, len(template.vertices)
-        self.atlas = Atlas(template, config.map_size)
-        grid = self.atlas.grid
-        places = interpolate(template.vertices, grid.samples)
+        self.config, self.vertex_count, size = config, len(template.vertices), config.map_size
+        self.atlas = Atlas(template, size)
+        places, pixels = interpolate(template.vertices, self.atlas.grid.samples), self.atlas.map_pixels
         chosen = farthest_points(places, min(config.patches, len(places))).sort().values
-        corners = torch.stack([grid.pixels[chosen] % config.map_size, grid.pixels[chosen] // config.map_size], dim=-1)
-        rows, columns = torch.meshgrid(*[torch.arange(config.map_size)] * 2, indexing="ij")
-        pixels = torch.stack([columns, rows, torch.zeros_like(rows)], dim=-1).flatten(0, 1).float()
-        owner = nearest(pixels[None], pad(corners, (0, 1))[None].float().cpu())[0]
-        for name, value in {
-            "patch_pixels": grid.pixels[chosen],
-            "patch_corners": corners,
-            "patch_vertex_ids": grid.samples.vertex_ids[chosen],
-            "patch_barycentric": grid.samples.barycentric[chosen],
-            "patch_face_ids": grid.samples.face_ids[chosen],
-            "patch_of_pixel": owner,
-        }.items():
+        corners = torch.stack([pixels[chosen] % size, pixels[chosen] // size], dim=-1)
+        rows, columns = torch.meshgrid(*[torch.arange(size)] * 2, indexing="ij")
+        places = torch.stack([columns, rows, torch.zeros_like(rows)], dim=-1).flatten(0, 1).float()
+        owner = nearest(places[None], pad(corners, (0, 1))[None].float().cpu())[0]
+        for name, value in {"patch_rows": chosen, "patch_corners": corners, "patch_of_pixel": owner}.items():
             self.register_buffer(name, value.clone(), persistent=False)
         channels = config.pose_encoder.out_channels
         if config.pose_feature is PoseFeature.local:
@@ -125,36 +111,37 @@ class ScaleAvatar(nn.Module):
     @property
     def patches(self) -> SurfaceSamples:
         """The patches' places on the body."""
-        return SurfaceSamples(self.patch_vertex_ids, self.patch_barycentric, self.patch_face_ids)
+        atlas, rows = self.atlas, self.patch_rows
+        return SurfaceSamples(atlas.map_vertex_ids[rows], atlas.map_barycentric[rows], atlas.map_face_ids[rows])
 
     def template_samples(self, points: int) -> SurfaceSamples:
-        """The points this network predicts when about ``points`` are asked for: k x k cells of every patch's pixel.
+        """About ``points`` places where this network predicts: k x k cells of every patch's pixel.
 
         A cell off the patch's triangle lies in the plane of it, so its barycentric coordinates may be negative.
         """
-        side = max(1, round(math.sqrt(points / len(self.patch_pixels))))
+        patches = self.patches
+        side = max(1, round(math.sqrt(points / len(self.patch_rows))))
         steps = (torch.arange(side, device=self.patch_corners.device, dtype=torch.float64) + 0.5) / side
         cells = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1).flatten(0, 1)
         uv = (self.patch_corners[:, None] + cells).flatten(0, 1) / self.config.map_size
-        face_ids = self.patch_face_ids.repeat_interleave(side**2)
+        face_ids = patches.face_ids.repeat_interleave(side**2)
         barycentric = uv_barycentric(uv, self.atlas.uv[self.atlas.uv_faces[face_ids]].double())
-        vertex_ids = self.patch_vertex_ids.repeat_interleave(side**2, dim=0)
-        return SurfaceSamples(vertex_ids, barycentric.to(self.patch_barycentric.dtype), face_ids)
+        vertex_ids = patches.vertex_ids.repeat_interleave(side**2, dim=0)
+        return SurfaceSamples(vertex_ids, barycentric.to(patches.barycentric.dtype), face_ids)
 
     def pose_features(self, pose_vertices: Tensor) -> Tensor:
         """Pose features of the patches: ``(B, V, 3)`` posed body to ``(B, P, C)``."""
         if self.config.pose_feature is PoseFeature.local:
             features = self.pose_encoder(self.atlas.position_map(pose_vertices)).flatten(2).transpose(1, 2)
-            return gather_sum(features, SparseRows.of_table(self.patch_pixels[:, None], features.shape[1]))
+            return gather_sum(
+                features, SparseRows.of_table(self.atlas.map_pixels[self.patch_rows, None], features.shape[1])
+            )
         centres = interpolate(pose_vertices, self.patches)
         return self.pose_encoder(centres)[:, None].expand(-1, centres.shape[1], -1)
 
     def patch_frames(self, vertices: Tensor) -> Tensor:
-        """Frames of the patches' posed triangles: two edges, and the normal as long as edges are on average.
-
-        ``(B, V, 3)`` to ``(B, P, 3, 3)`` with the axes as columns; neither orthogonal nor of unit length.
-        """
-        first, second, third = (vertices[:, self.patch_vertex_ids[:, corner]] for corner in range(3))
+        """Frames ``(B, P, 3, 3)`` of posed triangles, axes as columns: two edges, a normal as long as their mean."""
+        first, second, third = (vertices[:, ids] for ids in self.patches.vertex_ids.unbind(dim=1))
         edges = torch.stack([second - first, third - first], dim=-1)
         length = edges.norm(dim=-2).mean(dim=(1, 2))[:, None, None]
         normals = normalize(torch.linalg.cross(edges[..., 0], edges[..., 1], dim=-1), dim=-1, eps=1e-20)

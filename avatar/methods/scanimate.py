@@ -10,26 +10,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar.canonical.fields import SkinningField, SkinningFieldConfig, bounding_box
-from avatar.checks import AvatarError, DataError
-from avatar.data.batches import LruSequence
-from avatar.data.canonical_frames import CanonicalBatch, CanonicalFrame, CanonicalFrames, canonical_frame
-from avatar.data.mirroring import mirror_map
+from avatar.canonical.fields import BodyField, SkinningField, SkinningFieldConfig, bounding_box
+from avatar.checks import AvatarError, DataError, check_range
+from avatar.data.batches import (
+    CanonicalBatch,
+    CanonicalFrame,
+    CanonicalFrames,
+    LruSequence,
+    canonical_frame,
+    mirror_map,
+)
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.environment import choose_device
+from avatar.implicit import losses
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig, sample_mesh
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.implicit.fields import BodyField
-from avatar.implicit.losses import (
-    TERMS,
-    ImplicitLossConfig,
-    QueryConfig,
-    QueryPoints,
-    implicit_loss,
-    query_field,
-    sample_queries,
-)
+from avatar.implicit.losses import ImplicitLossConfig, QueryConfig, QueryPoints
 from avatar.methods.base import CANONICALIZER, SEED_STRIDE, Inputs, Method, Position, Stage, Task, TrainedAvatar
 from avatar.methods.canonicalizer import canonical_outfits, canonicalizer_folder, find_field
 from avatar.methods.points import check_count
@@ -46,28 +43,20 @@ BOX_MARGIN = 0.05  # of the longest side: space around scans and body, so that n
 class ImplicitTrainConfig:
     """What training an implicit avatar has besides its budget (`TrainConfig`)."""
 
-    probes: QueryConfig = field(default_factory=QueryConfig)
+    queries: QueryConfig = field(default_factory=QueryConfig)
     loss: ImplicitLossConfig = field(default_factory=ImplicitLossConfig)
     decay: float = 0.1  # factor on the learning rate, on top of train.schedule, at each of
     decay_at: tuple[float, ...] = (0.5, 0.75)  # these shares of training (the paper's)
 
     def __post_init__(self):
-        if not 0 < self.decay <= 1 or any(not 0 < share < 1 for share in self.decay_at):
-            expected = "decay: expected above 0 and at most 1, decay_at: shares between 0 and 1"
-            raise AvatarError(f"{expected}, got {self.decay} and {self.decay_at}.")
-
-    def rate_factor(self, progress: float) -> float:
-        """The learning rate's factor from the decays that are past at a share of training."""
-        return self.decay ** sum(progress >= share for share in self.decay_at)
+        check_range(self, "decay", above=0, high=1)
+        if any(not 0 < share < 1 for share in self.decay_at):
+            raise AvatarError(f"decay_at: expected shares between 0 and 1, got {self.decay_at}.")
 
 
 @dataclass
 class ScanimateConfig:
-    """Options of the `scanimate` method: ``method.settings`` of a run.
-
-    Of ``train`` the budget and the optimiser count (steps, minutes, batch, scan_points, lr, schedule, warmup, clip,
-    mirror, seed and how often to log, validate and save); template points and point losses have no part in it.
-    """
+    """Options of the `scanimate` method; of a run's ``train``, template points and point losses have no part in it."""
 
     avatar: ImplicitConfig = field(default_factory=ImplicitConfig)
     train: ImplicitTrainConfig = field(default_factory=ImplicitTrainConfig)
@@ -76,7 +65,7 @@ class ScanimateConfig:
 class ImplicitTask(Task):
     """Training of a signed distance: points on T-pose scans and in space, and a second-order loss (eqs. 14-17)."""
 
-    terms = TERMS
+    terms = losses.TERMS
     criterion = "surface"
 
     def __init__(
@@ -97,7 +86,8 @@ class ImplicitTask(Task):
 
     def rate_factor(self, step: int, progress: float) -> float:
         """The learning rate's factor: warm-up, the schedule's and the decays that are past."""
-        return self.config.rate_factor(step, progress) * self.settings.rate_factor(progress)
+        past = sum(progress >= share for share in self.settings.decay_at)
+        return self.config.rate_factor(step, progress) * self.settings.decay**past
 
     def inputs_at(self, step: int) -> tuple[CanonicalBatch, QueryPoints]:
         batch = self.data.batch_at(step, self.config.batch)
@@ -110,12 +100,12 @@ class ImplicitTask(Task):
     def space_at(self, batch: CanonicalBatch, key: int) -> QueryPoints:
         """The points in space that a key draws for a batch on the CPU."""
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key + 1)
-        return sample_queries(batch.points, self.body, self.box, self.settings.probes, generator)
+        return losses.sample_queries(batch.points, self.body, self.box, self.settings.queries, generator)
 
     def loss(self, inputs: Inputs, position: Position) -> LossTerms:
         batch, space = inputs
-        values = query_field(self.model, batch.points, space, batch.joint_transforms)
-        return implicit_loss(values, batch.normals, self.settings.loss, batch.colors)
+        values = losses.query_field(self.model, batch.points, space, batch.joint_transforms)
+        return losses.implicit_loss(values, batch.normals, self.settings.loss, batch.colors)
 
     def shown(self, values: dict[str, float]) -> dict[str, str]:
         return super().shown(values) | {"surface": f"{values['surface'] * 1e3:.1f}mm"}
@@ -179,7 +169,8 @@ class Scanimate(Method):
 
         def dress(body: BodyFit) -> Surface:
             joint_transforms = torch.from_numpy(np.asarray(body.joint_transforms, np.float32))
-            mesh = avatar.model.posed_mesh(joint_transforms, surface)
+            mesh = avatar.model.canonical_mesh(joint_transforms, surface)
+            mesh = avatar.model.pose_mesh(mesh, joint_transforms)
             return Surface(sample_mesh(mesh, points), mesh)
 
         return dress
@@ -189,10 +180,7 @@ class Scanimate(Method):
 
 
 def read_frames(outfit: Outfit, names: tuple[str, ...], colored: bool) -> Sequence[CanonicalFrame]:
-    """The canonical scans of training frames with their poses, read when they are needed.
-
-    Raises `DataError` for a scan that is not there, or without colours where they are to be learned.
-    """
+    """Canonical scans of training frames, read when needed; `DataError` for one without the colours to be learned."""
 
     def read(index: int) -> CanonicalFrame:
         frame = canonical_frame(outfit.load("train", names[index]))

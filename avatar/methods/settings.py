@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -26,6 +27,17 @@ class Schedule(Enum):
     cosine = "cosine"  # falls to a hundredth
 
 
+class Clock(Enum):
+    """Clock that `minutes` of a budget are read from."""
+
+    wall = "wall"
+    processor = "processor"  # of all threads of a process together: fair to jobs that share a machine
+
+    def seconds(self) -> float:
+        """Seconds since some moment."""
+        return time.process_time() if self is Clock.processor else time.monotonic()
+
+
 class Precision(Enum):
     """Arithmetic of the network's forward pass; positions, distances and losses are always float32."""
 
@@ -38,7 +50,8 @@ class TrainConfig:
     """Budget, optimiser and bookkeeping of one training run."""
 
     steps: int = 20000  # optimiser steps; the schedule's end unless minutes says otherwise
-    minutes: float | None = None  # wall-clock budget; training ends at whichever comes first
+    minutes: float | None = None  # budget of time; training ends at whichever comes first
+    clock: Clock = Clock.wall  # that minutes are read from
     batch: int = 4  # frames a step
     points: int = 50000  # template points predicted for each frame
     fresh_points: bool = False  # draw new template points every step, instead of one fixed set

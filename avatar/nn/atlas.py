@@ -21,11 +21,10 @@ class Atlas(nn.Module):
         """Rasterises a template's atlas once. Raises `AvatarError` for a template without UV coordinates."""
         super().__init__()
         if template.uv is None or template.uv_faces is None:
-            raise AvatarError(
-                "template: expected a body with UV coordinates, as methods of the UV plane need, got one without. "
-                "The open body, anny's and SMPL-X's have them; for any other: "
-                "python tools/convert_body.py <body file> <new file> --uv <OBJ of its mesh, with texture coordinates>."
-            )
+            problem = "expected a body with UV coordinates, as methods of the UV plane need, got one without"
+            hint = "The open body, anny's and SMPL-X's have them; for any other: python tools/convert_body.py"
+            command = "<body file> <new file> --uv <OBJ of its mesh, with texture coordinates>"
+            raise AvatarError(f"template: {problem}. {hint} {command}.")
         grid = rasterise_uv(template.uv, template.uv_faces, template.faces, map_size)
         self.map_size = map_size
         for name, value in {
@@ -73,10 +72,9 @@ class Atlas(nn.Module):
 
 
 class LookUp:
-    """Bilinear interpolation of feature images at UV coordinates, in the coordinates' precision.
+    """Bilinear interpolation of feature images at UV coordinates, in their precision; constant beyond border pixels.
 
-    Beyond the outermost centres of pixels an image is constant. A weighted sum of four pixels a point, faster than
-    ``grid_sample`` and repeatable: the backward pass of that adds in a random order on CUDA.
+    A weighted sum of four pixels a point, faster than ``grid_sample`` and, on CUDA, repeatable.
     """
 
     def __init__(self, uv: Tensor, size: int):

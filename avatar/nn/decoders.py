@@ -135,7 +135,7 @@ class TemplateNetwork(nn.Module):
         garment, places = self.garment_features(codes, samples), self.places(samples)
         parts = []
         if self.config.template:
-            decoded = self.garment_decoder(garment, places)
+            decoded = self.decode_garment(codes, garment, places, samples)
             parts.append(Decoded(pick(decoded.offsets, row), pick(decoded.normals, row)))
         if wrinkles and self.pose_decoder:
             pose = self.pose_features(batch, samples)
@@ -151,6 +151,10 @@ class TemplateNetwork(nn.Module):
             wrinkle_normals=scaled[-1].normals if both else None,
             codes=codes,
         )
+
+    def decode_garment(self, codes: Tensor, garment: Tensor, places: Tensor, samples: SurfaceSamples) -> Decoded:
+        """The garment template of each outfit, ``(O, N, 3)``, from codes ``(O, ...)`` and features ``(O, N, C)``."""
+        return self.garment_decoder(garment, places)
 
     def bare_body(self, samples: SurfaceSamples) -> Decoded:
         """Zero offsets and the normals that decoders correct, ``(1, N, 3)``: the body's, or none."""
@@ -178,7 +182,7 @@ class TemplateNetwork(nn.Module):
         if not self.config.template:
             raise AvatarError("template: this model was built without an explicit garment template (template=false).")
         codes = self.codes[outfit : outfit + 1]
-        decoded = self.garment_decoder(self.garment_features(codes, samples), self.places(samples))
+        decoded = self.decode_garment(codes, self.garment_features(codes, samples), self.places(samples), samples)
         local = (self.bare_body(samples) + decoded).scaled(self.config.offset_scale)
         points = interpolate(self.vertices, samples) + local.offsets
         return Prediction(points, normalize(local.normals, dim=-1), local.offsets)

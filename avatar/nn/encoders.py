@@ -11,10 +11,9 @@ from torch import Tensor, nn
 from torch.nn.functional import linear, relu
 
 from avatar.checks import AvatarError, check_shape
-from avatar.geometry.neighbours import ball_query, k_nearest
+from avatar.geometry.neighbours import ball_query
 from avatar.geometry.precision import widen
-from avatar.geometry.sparse import SparseRows
-from avatar.nn.hierarchy import FixedRows, HierarchyConfig, Level, build_levels
+from avatar.nn.hierarchy import FixedRows, HierarchyConfig, Level, build_levels, centre_rows
 from avatar.nn.layers import PointNorm, WideLinear, point_mlp, wide_linear
 from avatar.records import Template
 
@@ -69,22 +68,27 @@ class SurfaceEncoder(nn.Module):
     The template's vertices are the point cloud; what changes from frame to frame (posed vertices, a garment code)
     comes as features. All sampling and grouping is computed once, with the hierarchy.
 
-    ``stage(level, channels, widths)`` makes what goes down one level, ``(B, N, C)`` features of the finer level to
-    ``(B, S, C')`` of the coarser; the last of its widths is C'. A ``stem`` of the first stage's width may come before.
+    ``stage(level, channels, widths, relative)`` makes what goes down one level, ``(B, N, C)`` features of the finer
+    level to ``(B, S, C')`` of the coarser; the last of its widths is C'. A ``stem`` of the first stage's width may come
+    before.
     """
 
-    stage: Callable[[Level, int, tuple[int, ...]], nn.Module]
+    stage: Callable[[Level, int, tuple[int, ...], bool], nn.Module]
     has_stem = False
 
-    def __init__(self, template: Template, channels: int, config: PointNet2Config):
-        """Builds the encoder for one template and ``channels`` input features a vertex."""
+    def __init__(self, template: Template, channels: int, config: PointNet2Config, relative: bool = False):
+        """Builds the encoder for one template and ``channels`` input features a vertex.
+
+        With ``relative`` the first stage sees how features differ from those of a group's centre as well.
+        """
         super().__init__()
         self.channels, self.out_channels = channels, config.propagation[-1][-1]
         levels = build_levels(template.vertices, config.hierarchy)
         widths = [widths[-1] for widths in config.abstraction]
         self.stem = point_mlp((channels, widths[0]), WideLinear) if self.has_stem else nn.Identity()
         widths.insert(0, widths[0] if self.has_stem else channels)
-        self.abstractions = nn.ModuleList(map(self.stage, levels, widths, config.abstraction))
+        first = [relative, *[False] * len(levels)]
+        self.abstractions = nn.ModuleList(map(self.stage, levels, widths, config.abstraction, first))
         self.propagations, coarse = nn.ModuleList(), widths.pop()
         for level, mlp in zip(reversed(levels), config.propagation):
             self.propagations.append(FeaturePropagation(level, coarse, widths.pop(), mlp))
@@ -108,20 +112,29 @@ class SetAbstraction(nn.Module):
     The first layer sees [neighbour feature, relative position] and is linear, so it is applied once a point before
     gathering, not once a neighbour: W_f f_j + W_p (x_j - x_i) = (W_f f_j + W_p x_j) - W_p x_i, exactly. In bfloat16
     the difference would be 7% rounding, so this layer and its normalisation are always float32.
+
+    A ``relative`` one sees (f_j - f_i) / radius as well, by a layer of its own: how positions turn and stretch about
+    the centre, which is far smaller than they are themselves.
     """
 
-    def __init__(self, level: Level | Neighbourhoods, channels: int, widths: tuple[int, ...]):
+    def __init__(self, level: Level | Neighbourhoods, channels: int, widths: tuple[int, ...], relative: bool = False):
         super().__init__()
         self.level = level
         self.feature_layer = WideLinear(channels, widths[0])
         self.position_layer = WideLinear(3, widths[0], bias=False)
         self.first = nn.Sequential(PointNorm(widths[0]), nn.ReLU())
         self.rest = point_mlp(widths)
+        self.difference_layer = WideLinear(channels, widths[0], bias=False) if relative else None
+        self.own = centre_rows(level) if relative else None
 
     def forward(self, features: Tensor) -> Tensor:
         """``(B, N, C)`` features of the finer level to ``(B, S, C')`` of the coarser."""
         lifted = self.feature_layer(features) + self.position_layer(self.level.finer_positions)
-        grouped = self.level.group(lifted) - self.position_layer(self.level.positions)[:, None]
+        centres = self.position_layer(self.level.positions)
+        if self.difference_layer is not None:
+            differing = self.difference_layer(features / self.level.radius)
+            lifted, centres = lifted + differing, centres + self.own(differing)
+        grouped = self.level.group(lifted) - centres.unsqueeze(-2)
         return self.rest(self.first(grouped)).amax(dim=2)
 
 
@@ -172,15 +185,14 @@ class PointMLPLevel(nn.Module):
 
     The neighbours' differences alone would not tell what is at the centre, so its own feature is joined to them; the
     layer that takes both is linear, and applied to a centre once. Differences are taken, and centres seen, in float32.
-    ``widths`` are the inner widths of the residual blocks, then the stage's own.
+    ``widths`` are the inner widths of the residual blocks, then the stage's own. All its features are ``relative``.
     """
 
-    def __init__(self, level: Level, channels: int, widths: tuple[int, ...]):
+    def __init__(self, level: Level, channels: int, widths: tuple[int, ...], relative: bool = True):
         super().__init__()
         *inner, width = widths
         self.level = level
-        own = k_nearest(level.positions[None], level.finer_positions[None], 1)[0]
-        self.own = FixedRows(SparseRows.of_table(own, len(level.finer_positions)))  # centres
+        self.own = centre_rows(level)
         self.affine = GeometricAffine(channels + 3)
         self.difference_layer = nn.Linear(channels + 3, width, bias=False)
         self.centre_layer = WideLinear(channels + 3, width)
@@ -211,11 +223,12 @@ class PointMLP(SurfaceEncoder):
 class Neighbourhoods(nn.Module):
     """Groups of points around centres with positions in units of the groups' radius, so that all scales look alike.
 
-    As a `Level` has, ``positions (S, 3)``, ``finer_positions (N, 3)``, ``groups (S, K)`` and ``group``.
+    As a `Level` has, ``positions (S, 3)``, ``finer_positions (N, 3)``, ``groups (S, K)``, ``group`` and ``radius``.
     """
 
     def __init__(self, centres: Tensor, points: Tensor, groups: Tensor, radius: float):
         super().__init__()
+        self.radius = radius
         self.register_buffer("positions", centres / radius, persistent=False)
         self.register_buffer("finer_positions", points / radius, persistent=False)
         self.register_buffer("groups", groups.clone(), persistent=False)
@@ -238,14 +251,15 @@ class InvertedResidual(nn.Module):
 class PointNeXtLevel(nn.Sequential):
     """One stage: a set abstraction, then inverted residual blocks that look twice as far."""
 
-    def __init__(self, level: Level, channels: int, widths: tuple[int, ...]):
+    def __init__(self, level: Level, channels: int, widths: tuple[int, ...], relative: bool = False):
         *inner, width = widths
         down = Neighbourhoods(level.positions, level.finer_positions, level.groups, level.radius)
         reach, count = 2 * level.radius, min(level.groups.shape[1], len(level.groups))
-        groups = ball_query(level.positions, level.positions, reach, count)
+        ranks = torch.arange(len(level.positions)) if level.spread else None  # they are in farthest-point order
+        groups = ball_query(level.positions, level.positions, reach, count, ranks)
         around = Neighbourhoods(level.positions, level.positions, groups, reach)
         blocks = (InvertedResidual(around, width, wide) for wide in inner)
-        super().__init__(SetAbstraction(down, channels, (width,)), *blocks)
+        super().__init__(SetAbstraction(down, channels, (width,), relative), *blocks)
 
 
 class PointNeXt(SurfaceEncoder):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from avatar.checks import AvatarError, check_shape
@@ -20,6 +21,7 @@ class HierarchyConfig:
     points: tuple[int, ...] = (4096, 2048, 1024, 512, 256, 128)
     radii: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # metres
     neighbours: int = 32  # group size of every ball query
+    spread: bool = True  # groups are spread over their balls; False takes the nearest points, far inside the radius
 
     def __post_init__(self):
         self.points, self.radii = tuple(self.points), tuple(self.radii)
@@ -61,22 +63,28 @@ class Level(nn.Module):
     the three nearest coarse points (PointNet++ eq. 2).
     """
 
-    def __init__(self, finer: Tensor, count: int, radius: float, neighbours: int):
+    def __init__(self, finer: Tensor, coarse: Tensor, radius: float, neighbours: int, ranks: Tensor | None = None):
+        """Builds the step from points ``(N, 3)`` to some of them ``(S, 3)``; ``ranks (N,)`` as in `ball_query`."""
         super().__init__()
-        self.radius = radius
-        coarse = finer[farthest_points(finer, count)]
-        up_ids = k_nearest(finer[None], coarse[None], min(3, count))[0]
+        self.radius, self.spread = radius, ranks is not None
+        up_ids = k_nearest(finer[None], coarse[None], min(3, len(coarse)))[0]
         inverse = 1 / ((finer[:, None] - coarse[up_ids]).square().sum(dim=-1) + 1e-8)
         for name, value in {
             "positions": coarse,
             "finer_positions": finer,
-            "groups": ball_query(coarse, finer, radius, neighbours),
+            "groups": ball_query(coarse, finer, radius, neighbours, ranks),
             "up_ids": up_ids,
             "up_weights": inverse / inverse.sum(dim=1, keepdim=True),
         }.items():
             self.register_buffer(name, value.clone(), persistent=False)
         self.group = FixedRows.of_groups(self.groups, len(finer))
-        self.interpolate_up = FixedRows(SparseRows.of_table(self.up_ids, count, self.up_weights))
+        self.interpolate_up = FixedRows(SparseRows.of_table(self.up_ids, len(coarse), self.up_weights))
+
+
+def centre_rows(level: Level) -> FixedRows:
+    """Picks each coarse point's own row among the finer ones: ``(B, N, C)`` to ``(B, S, C)``."""
+    own = k_nearest(level.positions[None], level.finer_positions[None], 1)[0]
+    return FixedRows(SparseRows.of_table(own, len(level.finer_positions)))
 
 
 def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:
@@ -89,7 +97,11 @@ def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:
         expected = f"a finest level below the template's {count} vertices"
         raise AvatarError(f"points: expected {expected}, got {config.points[0]}.")
     levels, finer = nn.ModuleList(), positions.detach()
+    order = farthest_points(finer, config.points[0])
+    ranks = torch.arange(len(order), len(order) + len(finer), device=order.device)  # of the others, as they come
+    ranks[order] = torch.arange(len(order), device=order.device)
     for count, radius in zip(config.points, config.radii):
-        levels.append(Level(finer, count, radius, config.neighbours))
-        finer = levels[-1].positions
+        levels.append(Level(finer, finer[order[:count]], radius, config.neighbours, ranks if config.spread else None))
+        finer, order = levels[-1].positions, torch.arange(count, device=order.device)
+        ranks = order
     return levels

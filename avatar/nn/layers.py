@@ -21,17 +21,13 @@ wide_linear = full_precision(linear)
 class WideLinear(nn.Linear):
     """A linear layer in full precision: ``(..., C)`` to ``(..., C')``."""
 
-    @full_precision
-    def forward(self, features: Tensor) -> Tensor:
-        return super().forward(features)
+    forward = full_precision(nn.Linear.forward)
 
 
 class WideConv2d(nn.Conv2d):
     """A convolution in full precision: ``(B, C, H, W)`` to ``(B, C', H', W')``."""
 
-    @full_precision
-    def forward(self, image: Tensor) -> Tensor:
-        return super().forward(image)
+    forward = full_precision(nn.Conv2d.forward)
 
 
 class PointNorm(nn.BatchNorm1d):
@@ -50,8 +46,7 @@ def point_mlp(
     """
     layers: list[nn.Module] = []
     for fan_in, fan_out in itertools.pairwise(widths):
-        kind = nn.Linear if layers else first
-        layers += [kind(fan_in, fan_out), PointNorm(fan_out), activation()]
+        layers += [(nn.Linear if layers else first)(fan_in, fan_out), PointNorm(fan_out), activation()]
     return nn.Sequential(*layers)
 
 
@@ -74,8 +69,7 @@ class _GatherMoments(torch.autograd.Function):
 class SharedNorm(_BatchNorm):
     """Batch normalisation over the batches of all ranks, with the parameters and buffers of the layer it stands for.
 
-    nn.SyncBatchNorm does this on CUDA alone. Each process gives count, mean and variance; the whole batch's follow from
-    them without cancellation (Chan's formula).
+    As nn.SyncBatchNorm on CUDA; the batch's moments follow from each rank's without cancellation (Chan's formula).
     """
 
     dimension = -1  # of the channels
@@ -115,8 +109,7 @@ def synchronize_norms(model: nn.Module, replicated: Collection[str] = ()) -> Non
     """Turns the batch normalisations of a model into `SharedNorm`s, in place; names and weights stay the same.
 
     Those of the ``replicated`` submodules stay as they are: every process runs them on all outfits of the step
-    (`step_outfits`), so each has the whole batch's statistics by itself. Raises `AvatarError` for a kind of
-    normalisation whose statistics it would not know how to synchronise.
+    (`step_outfits`). Raises `AvatarError` for a kind of normalisation that it does not know.
     """
     for path, parent in list(model.named_modules()):
         if path.partition(".")[0] in replicated:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from avatar.body.skinning import tree_distances
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, check_range
 from avatar.geometry.precision import full_precision
 from avatar.geometry.surface import interpolate
-from avatar.geometry.transforms import relative_quaternions
+from avatar.geometry.transforms import fourier_features, relative_quaternions
 from avatar.nn.layers import PointNorm, point_mlp
 from avatar.records import SurfaceSamples, Template
 
@@ -26,9 +27,9 @@ class LocalPoseConfig:
 
     def __post_init__(self):
         self.widths = tuple(self.widths)
-        if self.rings < 0 or self.orders < 0 or not self.widths or min(self.widths) < 1:
-            expected = "rings, orders: expected at least 0, widths: one or more positive numbers of channels"
-            raise AvatarError(f"{expected}, got {self.rings}, {self.orders} and {self.widths}.")
+        check_range(self, "rings", "orders", low=0)
+        if not self.widths or min(self.widths) < 1:
+            raise AvatarError(f"widths: expected one or more positive numbers of channels, got {self.widths}.")
 
 
 def pose_gates(template: Template, rings: int) -> Tensor:
@@ -76,11 +77,5 @@ class LocalPoseEncoder(nn.Module):
         rotations = relative_rotations(joint_transforms, self.parents)
         columns = self.pose_layer.weight.unflatten(1, rotations.shape[1:])
         joints = torch.einsum("bjq,cjq->bjc", rotations, columns)
-        places = self.position_layer(fourier_features(interpolate(self.vertices, samples), self.orders))
+        places = self.position_layer(fourier_features(interpolate(self.vertices, samples), self.orders, math.pi))
         return interpolate(self.gates, samples) @ joints + places + self.pose_layer.bias
-
-
-def fourier_features(points: Tensor, orders: int) -> Tensor:
-    """Points ``(..., 3)`` in metres, and sin and cos of 2^k pi of them: ``(..., 3 + 6 orders)``."""
-    waves = [wave(2**order * torch.pi * points) for order in range(orders) for wave in (torch.sin, torch.cos)]
-    return torch.cat([points, *waves], dim=-1)

@@ -15,11 +15,10 @@ from avatar.records import SurfaceSamples, Template
 
 
 class LearnedSkinning(nn.Module):
-    """Forward skinning with one field an outfit (SCANimate 3.1), on the subject's own body.
+    """Forward skinning with one field an outfit (SCANimate 3.1), evaluated at the offset points themselves.
 
-    A skirt's points hang far from the skin they belong to on the template; with the body's weights they follow that
-    skin and tear between the legs. A field is evaluated at the offset point itself. A run's template is the mean of its
-    outfits' bodies, so each subject's own canonical body is kept here, in the state that is saved with the weights.
+    With the body's weights a skirt's points would follow the skin they hang from and tear between the legs. A run's
+    template is the mean of its outfits' bodies, so each subject's own is kept in the state saved with the weights.
     """
 
     def __init__(self, fields: Sequence[nn.Module], subjects: Sequence[Template], trainable: bool = False):

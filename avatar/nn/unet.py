@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from avatar.checks import AvatarError, check_shape
+from avatar.checks import AvatarError, check_range, check_shape
 from avatar.nn.layers import WideConv2d
 
 SMOOTH_LEVELS = 3  # the last ones upsample and convolve, for transposed convolutions leave checkerboards
@@ -25,23 +25,21 @@ class UNetConfig:
     affine: bool = False  # whether normalisations learn a scale and a shift
 
     def __post_init__(self):
-        if self.levels < SMOOTH_LEVELS or self.width < 1 or self.out_channels < 1:
-            expected = f"expected at least {SMOOTH_LEVELS}, 1 and 1"
-            raise AvatarError(f"levels, width, out_channels: {expected}, got {vars(self)}.")
+        check_range(self, "levels", low=SMOOTH_LEVELS)
+        check_range(self, "width", "out_channels", low=1)
 
-    def check_map_size(self, size: int) -> None:
-        """Refuses images whose ``size`` pixels a side cannot be halved at every level, with an `AvatarError`."""
+    def check_map_size(self, *sizes: int, name: str = "map_size") -> None:
+        """Refuses images whose pixels a side cannot be halved at every level, with an `AvatarError` for ``name``."""
         parts = 2**self.levels
-        if size < 1 or size % parts:
-            needed = f"expected a multiple of {parts}, as pose_encoder.levels={self.levels} halvings need"
-            raise AvatarError(f"map_size: {needed}, got {size}.")
+        if min(sizes) < 1 or any(size % parts for size in sizes):
+            needed = f"expected a multiple of {parts}, as the {self.levels} levels of pose_encoder.levels need"
+            raise AvatarError(f"{name}: {needed}, got {' x '.join(map(str, sizes))}.")
 
 
 class Doubling(nn.Module):
-    """Bilinear interpolation of images to twice their size, ``(..., H, W)`` to ``(..., 2 H, 2 W)``.
+    """Bilinear interpolation of images, ``(..., H, W)`` to ``(..., 2 H, 2 W)`` (``align_corners=False``).
 
-    The same as torch's (``align_corners=False``) but as two matrix products, whose backward pass is repeatable on CUDA,
-    where torch's own adds in an order of chance.
+    Two matrix products: unlike torch's own, their backward pass is repeatable on CUDA.
     """
 
     def forward(self, image: Tensor) -> Tensor:
@@ -85,10 +83,8 @@ class UNet(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """``(B, C, H, W)`` to ``(B, C', H, W)``; raises `AvatarError` unless both are multiples of ``2 ** levels``."""
-        dims, parts = check_shape("image", image, "B C H W", C=self.channels), 2**self.config.levels
-        if dims["H"] % parts or dims["W"] % parts:
-            needed = f"height and width in multiples of {parts}, as {self.config.levels} levels need"
-            raise AvatarError(f"image: expected {needed}, got {dims['H']} x {dims['W']}.")
+        dims = check_shape("image", image, "B C H W", C=self.channels)
+        self.config.check_map_size(dims["H"], dims["W"], name="image")
         pyramid = []
         for down in self.downs:
             image = down(image)

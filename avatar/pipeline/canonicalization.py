@@ -10,28 +10,22 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from avatar.canonical.scans import SkinningSource, canonicalize_scan
+from avatar.canonical.fields import BodyField
+from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset
 from avatar.environment import prepared_process
-from avatar.evaluation.canonical_scores import canonical_table, score_canonicalization
-from avatar.evaluation.canonical_truth import Canonicalized, check_truth
+from avatar.evaluation.canonical import Canonicalized, canonical_table, check_truth, score_canonicalization
 from avatar.evaluation.scores import Scores, write_scores
 from avatar.evaluation.scoring import Label
 from avatar.evaluation.tables import to_markdown
-from avatar.export.pictures import (
-    contact_sheet,
-    frame_camera,
-    load_pyvista,
-    render_mesh,
-    render_points,
-    save_picture,
-)
-from avatar.io.canonical_scans import read_canonical_scan
+from avatar.export import pictures
+from avatar.export.pictures import load_pyvista
+from avatar.io.frames import read_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, module_digest
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole
-from avatar.methods.canonicalizer import CanonicalizeConfig, TrainedCanonicalizer, WeightSource
+from avatar.methods.canonicalizer import CanonicalizeConfig, SkinningSource, TrainedCanonicalizer, WeightSource
 from avatar.pipeline.scores import current_commit
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
@@ -45,29 +39,27 @@ PICTURE = (480, 480)
 @prepared_process()
 def canonicalize(config: CanonicalizeConfig) -> Path:
     """Trains or resumes a run's canonicalizer, writes every frame's canonical scan, draws some; gives the folder.
-
-    Raises:
-        AvatarError: before any training, when scores are asked for of data without truth, or pictures on a machine that
-            cannot draw.
+    Refuses before any training: scores of data without truth, and pictures on a machine that cannot draw.
     """
     frames = config.frames()
     check_scored(config, frames)
     if config.pictures:
         load_pyvista()
-    train_canonicalizer(config, frames)
-    canonicalize_frames(config, frames)
+    make_canonical_scans(config, frames)
     draw_canonical_scans(config, frames)
-    if config.scored:
-        score_canonical_scans(config, frames)
     return config.folder
 
 
-def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
-    """Refuses to score scans of which nobody knows where they belong at rest.
+def make_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> None:
+    """Trains or resumes a run's canonicalizer, writes every frame's canonical scan and scores some, if asked for."""
+    train_canonicalizer(config, frames)
+    canonicalize_frames(config, frames)
+    if config.scored:
+        score_canonical_scans(config, frames)
 
-    Raises:
-        AvatarError: for data that were not simulated.
-    """
+
+def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
+    """Refuses to score scans of which nobody knows where they belong at rest."""
     try:
         if config.scored:
             check_truth(frames.frame(0).scan)
@@ -77,21 +69,16 @@ def check_scored(config: CanonicalizeConfig, frames: FrameDataset) -> None:
 
 def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> Scores:
     """Writes ``<run>/scores.csv`` and ``scores.md``: this run, both baselines and the true weights on some frames.
-
     Variants are the splits: frames of training were learned from, those of test found their codes alone. What was
     measured before is measured again only where a scan, a canonicalizer or the code of either has changed.
-
-    Raises:
-        AvatarError: for data that were not simulated: nobody knows their canonical places.
     """
     outfit, scores, tables = frames.outfits[0], Scores(), []
-    kinds = dict.fromkeys((config.weights, WeightSource.knn, WeightSource.nearest))
     with lock_folder(config.folder, wait=True):
         ledger = Ledger(config.folder)
         for split in dict.fromkeys(where.split for where in frames.names):
             names = spaced_frames([where.name for where in frames.names if where.split == split], config.scored)
             methods, made_by = {}, {}
-            for kind in kinds:
+            for kind in dict.fromkeys((config.weights, WeightSource.knn, WeightSource.nearest)):
                 settings = replace(config, weights=kind)
                 source = skinning_source(settings, outfit.template)
                 learned = (source.steps, source.seconds) if isinstance(source, TrainedCanonicalizer) else (0, 0.0)
@@ -100,8 +87,8 @@ def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> S
                 made_by[label] = digest_of([scans_digest(settings), module_digest(__name__)])
             found = score_canonicalization(outfit, split, names, methods, ledger, made_by)
             plain = [replace(row, variant="") for row in found.rows]
-            tables.append(f"## {split}\n\n{to_markdown(canonical_table(plain, outfit.name))}")
-            scores = scores + found
+            tables.append(f"## {split}\n\n{to_markdown(canonical_table(plain, [outfit.name]))}")
+            scores += found
         text = "\n".join(tables)
         write_scores(config.folder / "scores.csv", scores)
         write_whole(config.folder / "scores.md", text.encode())
@@ -112,52 +99,42 @@ def score_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> S
 def canonicalizer_with(config: CanonicalizeConfig, source: SkinningSource) -> Callable[[Frame], Canonicalized]:
     """What a source of weights makes of a frame, with the weights that it gives to canonical points."""
     template = source.template
-    field = source.forward_field if isinstance(source, TrainedCanonicalizer) else None
+    field = source if isinstance(source, BodyField) else source.forward_field
 
     def unpose(frame: Frame) -> Canonicalized:
         weights = source.weights_of(frame.scan.points, frame)
         scan = canonicalize_scan(frame.scan, frame.body, weights, template, config.stretch)
-        if field is not None:
-            points = torch.from_numpy(scan.points)[None].to(next(field.parameters()).device)
-            with torch.no_grad():
-                return Canonicalized(scan, field(points)[0].cpu().numpy())
-        return Canonicalized(scan, source.blend_weights(scan.points, template.vertices.numpy()))
+        points = torch.from_numpy(scan.points)[None].to(next(field.buffers()).device)
+        with torch.no_grad():
+            return Canonicalized(scan, field(points)[0].cpu().numpy())
 
     return unpose
 
 
-def draw_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> list[Path]:
+def draw_canonical_scans(config: CanonicalizeConfig, frames: FrameDataset) -> None:
     """Writes ``<run>/pictures/<split>.png``: some scans before and after, by their normals and skinning weights."""
-    written = []
     places = {(where.split, where.name): index for index, where in enumerate(frames.names)}
-    for split in dict.fromkeys(where.split for where in frames.names):
+    for split in dict.fromkeys(where.split for where in frames.names) if config.pictures else ():
         chosen = spaced_frames([name for of, name in places if of == split], config.pictures)
-        if not chosen:
-            continue
         rows = [draw_frame(config, frames, places[split, name]) for name in tracked(chosen, "pictures", unit="picture")]
-        written.append(config.folder / "pictures" / f"{split}.png")
-        save_picture(written[-1], contact_sheet(rows, chosen, COLUMNS))
-    return written
+        sheet = pictures.contact_sheet(rows, chosen, COLUMNS)
+        pictures.save_picture(config.folder / "pictures" / f"{split}.png", sheet)
 
 
 def draw_frame(config: CanonicalizeConfig, frames: FrameDataset, index: int) -> list[np.ndarray]:
     """The row of pictures of one frame."""
-    where = frames.names[index]
-    scan = frames.frame(index).scan
+    where, scan = frames.names[index], frames.frame(index).scan
     canonical = read_canonical_scan(config.folder / "scans" / where.split / f"{where.name}.npz")
-    tints = weight_colors(canonical.weights)
-    grey = np.full_like(scan.points, 0.6)
+    tints, grey = weight_colors(canonical.weights), np.full_like(scan.points, 0.6)
     grey[canonical.source] = tints
-    posed, front = (frame_camera(points, size=PICTURE) for points in (scan.points, canonical.points))
-    before = (scan.points, scan.normals, scan.faces)
-    after = (canonical.points, canonical.normals, canonical.faces)
-    views = [(before, posed, "normals"), (before, posed, grey)]
-    views += [(after, front.seen_from(side), colors) for colors in ("normals", tints) for side in ("front", "back")]
+    posed, front = (pictures.frame_camera(of.points, size=PICTURE) for of in (scan, canonical))
+    views = [(scan, posed, "normals"), (scan, posed, grey)]
+    views += [(canonical, front.seen_from(side), by) for by in ("normals", tints) for side in ("front", "back")]
     return [
-        render_points(PointCloud(points, normals), camera, colors)
-        if faces is None
-        else render_mesh(Mesh(points, faces), camera, colors)
-        for (points, normals, faces), camera, colors in views
+        pictures.render_points(PointCloud(of.points, of.normals), camera, colors)
+        if of.faces is None
+        else pictures.render_mesh(Mesh(of.points, of.faces), camera, colors)
+        for of, camera, colors in views
     ]
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from torch import nn
 
@@ -34,8 +35,7 @@ class ParametersConfig:
     out: Path = Path("runs/tables")  # where parameters.csv and parameters.md go
 
 
-@dataclass(frozen=True)
-class Count:
+class Count(NamedTuple):
     """The parameters of one part of a method's network at one size; ``original`` those of the authors', if known."""
 
     method: str
@@ -55,23 +55,19 @@ def count_parameters(method: str, size: str, model: nn.Module) -> list[Count]:
     """A network's parts with parameters, their total, and the garment codes that come with every outfit."""
     parts = {name.replace("_", " "): sum(p.numel() for p in part.parameters()) for name, part in model.named_children()}
     codes = sum(p.numel() for name, p in model.named_parameters() if name == "codes")
-    parts[TOTAL] = sum(p.numel() for p in model.parameters()) - codes
-    parts[CODES] = codes
+    parts |= {TOTAL: sum(p.numel() for p in model.parameters()) - codes, CODES: codes}
     known = {part: ORIGINAL.get((method, part)) if size == "full" else None for part in parts}
     return [Count(method, size, part, count, known[part]) for part, count in parts.items() if count]
 
 
 def write_parameters(folder: Path, choices: Mapping[tuple[str, str], MethodChoice], template: Template) -> str:
     """Writes ``parameters.csv`` and ``parameters.md`` for networks by method and size; gives the latter's text."""
-    counts = [
-        count
-        for (method, size), choice in choices.items()
-        for count in count_parameters(method, size, build_network(choice, template))
-    ]
-    text = csv_text([f.name for f in fields(Count)], ((*astuple(c)[:-1], c.original or "") for c in counts))
-    write_whole(folder / "parameters.csv", text.encode())
+    counts = []
+    for (method, size), choice in choices.items():
+        counts += count_parameters(method, size, build_network(choice, template))
     sizes = grouped(counts, lambda count: count.size)
     markdown = "\n".join(to_markdown(parameter_table(mine, size)) for size, mine in sizes.items())
+    write_whole(folder / "parameters.csv", csv_text(Count._fields, counts).encode())  # None is an empty field
     write_whole(folder / "parameters.md", markdown.encode())
     return markdown
 
@@ -79,18 +75,12 @@ def write_parameters(folder: Path, choices: Mapping[tuple[str, str], MethodChoic
 def parameter_table(counts: list[Count], size: str) -> Table:
     """Methods by parts at one size, with the originals below the methods they are of."""
     parts = [*dict.fromkeys(c.part for c in counts if c.part not in (TOTAL, CODES)), TOTAL, CODES]
-    lines = {}
+    body = []
     for method, mine in grouped(counts, lambda count: count.method).items():
-        lines[method] = {count.part: count.parameters for count in mine}
-        lines[f"{method}, original"] = {count.part: count.original for count in mine if count.original}
-    body = [
-        TableRow(
-            label,
-            tuple(values.get(part) for part in parts),
-            texts=tuple(f"{values[part]:,}" if part in values else "–" for part in parts),
-        )
-        for label, values in lines.items()
-        if values
-    ]
-    notes = ("One outfit on the open body. Skinning fields of canonicalizers are not counted.",)
-    return Table(f"parameters, size={size}", "method", tuple(parts), tuple(body), notes)
+        originals = {count.part: count.original for count in mine if count.original}
+        lines = {method: {count.part: count.parameters for count in mine}, f"{method}, original": originals}
+        for label, line in lines.items():
+            texts = tuple(f"{line[part]:,}" if part in line else "–" for part in parts)
+            body += [TableRow(label, tuple(map(line.get, parts)), texts=texts)] if line else []
+    note = "One outfit on the open body. Skinning fields of canonicalizers are not counted."
+    return Table(f"parameters, size={size}", "method", tuple(parts), tuple(body), (note,))

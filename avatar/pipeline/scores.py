@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,11 +13,11 @@ from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.splits import split_outfit
 from avatar.environment import prepared_process
+from avatar.evaluation import scoring
 from avatar.evaluation.aggregate import FLOORS, by_split, method_key
-from avatar.evaluation.floors import score_body_floor, score_sampling_floor
 from avatar.evaluation.scores import Score, Scores, frames_path, read_scores, write_scores
-from avatar.evaluation.scoring import SOURCE, Label, ScoreConfig, find_predictions, remember_scores, score_predictions
-from avatar.evaluation.tables import View, metric_table, outfit_table, to_markdown
+from avatar.evaluation.scoring import SOURCE, Label, ScoreConfig, find_predictions, score_predictions
+from avatar.evaluation.tables import Table, View, metric_table, outfit_table, to_markdown
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.documents import read_json
 from avatar.io.ledger import Ledger, digest_of, keyed
@@ -27,7 +27,7 @@ from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.settings import RunConfig
 from avatar.nn.decoders import Normals
-from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.prediction import predict_frames
 from avatar.runs.training import load_avatar
 
 MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
@@ -93,25 +93,18 @@ def scores_file(folder: Path, split: str) -> Path:
 
 @prepared_process()
 def predict(config: PredictConfig) -> list[Path]:
-    """Predicts every outfit of a run; gives the folders of point clouds.
-
-    Raises:
-        DataError: when a motion is asked for and an outfit has only a mesh of its body.
-    """
-    avatar = load_avatar(config.run, config.checkpoint, config.device)
-    folders = []
+    """Predicts every outfit of a run; gives the folders of point clouds. A motion needs bodies that can be posed."""
+    avatar, folders = load_avatar(config.run, config.checkpoint, config.device), []
     for outfit in run_outfits(avatar, config.data_root):
         motion = config.motion and read_body_motion(config.motion, outfit.posable_body(), config.fps, config.up)
         name = motion.name if motion else config.split
         folders.append(predictions_folder(config.run, name, outfit.name))
         where = (folders[-1], meshes_folder(config.run, name, outfit.name), config.points, config.surface)
-        if motion is None:
-            predict_frames(avatar, outfit, config.split, *where)
-            continue
-        written = predict_motion(avatar, outfit, motion, *where)
-        for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
-            path.unlink()  # the end of an earlier prediction with more frames a second
-        write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
+        written = predict_frames(avatar, outfit, motion or config.split, *where)
+        if motion:
+            for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
+                path.unlink()  # the end of an earlier prediction with more frames a second
+            write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
     return folders
 
 
@@ -123,14 +116,12 @@ def predicted_fps(folder: Path) -> float:
 
 @prepared_process()
 def evaluate(config: EvaluateConfig) -> Scores:
-    """Scores runs, or a foreign program's predictions, beside their floors; prints the tables.
-
-    Each run's scores go to ``<run>/scores.csv``, the floors to `floors_folder`; those on another split than test to
-    ``scores.<split>.csv``. The ledger of each folder keeps what was measured: what is unchanged (predictions, data,
-    settings, and the code of the metrics) is not measured again.
+    """Scores runs, or a foreign program's predictions, beside their floors; prints the tables. Each run's scores go to
+    its `scores_file`, the floors to that in `floors_folder`. Ledgers there keep what was measured: what is unchanged
+    (predictions, data, settings, and the code of the metrics) is not measured again.
     """
     scores = score_runs(config) if config.predictions is None else score_foreign(config, config.predictions)
-    print_tables(scores)
+    print("\n".join(map(to_markdown, score_tables(scores.rows))))
     return scores
 
 
@@ -140,53 +131,53 @@ def score_foreign(config: EvaluateConfig, folder: Path) -> Scores:
     find_predictions(folder, outfit.frames(config.split))
     out = config.out or folder
     with lock_folder(out, wait=True):
-        ledger = Ledger(out)
-        scores = score_predictions(
-            folder, outfit, config.split, config.score, Label(config.label, split=config.split), None, ledger
-        )
+        ledger, label = Ledger(out), Label(config.label, split=config.split)
+        scores = score_predictions(folder, outfit, config.split, config.score, label, None, ledger)
         save_scores(out / "scores.csv", scores, ledger, keyed(SOURCE))
         floors = score_floors(outfit, config, scores.rows[0].points, out / "floors.csv") if config.floors else Scores()
     return floors + scores
 
 
 def score_runs(config: EvaluateConfig) -> Scores:
-    """Scores every outfit of every run, and its floors at the point count that most of the runs predict.
-
-    Predictions that are missing are refused before anything is scored.
-    """
-    scores, floors = Scores(), {}
+    """Scores every outfit of every run, and its floors at the point count that most runs predict."""
+    scores, floors, split = Scores(), {}, config.split
     avatars = {run: load_avatar(run) for run in config.runs}
-    for run, avatar in avatars.items():
-        for outfit in run_outfits(avatar, config.data_root):
-            find_predictions(predictions_folder(run, config.split, outfit.name), outfit.frames(config.split))
-    for run, avatar in avatars.items():
-        settings = avatar.config
-        label = Label(
-            settings.method.variant,
-            variant=variant_of(settings),
-            seed=settings.train.seed,
-            steps=avatar.steps,
-            seconds=avatar.seconds,
-            commit=current_commit(),
-            fraction=settings.split.train_fraction,
-            split=config.split,
-        )
-        mine, outfits = Scores(), run_outfits(avatar, config.data_root)
+    runs = [(run, avatar, run_outfits(avatar, config.data_root)) for run, avatar in avatars.items()]
+    for run, _, outfits in runs:
+        for outfit in outfits:
+            find_predictions(predictions_folder(run, split, outfit.name), outfit.frames(split))  # before any is scored
+    for run, avatar, outfits in runs:
+        mine, label = Scores(), label_of(avatar, split=split)
         with lock_folder(run / "predictions", wait=True):
             ledger = Ledger(run)
             for outfit in outfits:
-                folder = predictions_folder(run, config.split, outfit.name)
-                meshes = meshes_folder(run, config.split, outfit.name) if avatar.method.makes_meshes else None
-                mine = mine + score_predictions(folder, outfit, config.split, config.score, label, meshes, ledger)
-            save_scores(scores_file(run, config.split), mine, ledger, keyed(SOURCE))
-        scores = scores + mine
+                folder = predictions_folder(run, split, outfit.name)
+                meshes = meshes_folder(run, split, outfit.name) if avatar.method.makes_meshes else None
+                mine += score_predictions(folder, outfit, split, config.score, label, meshes, ledger)
+            save_scores(scores_file(run, split), mine, ledger, keyed(SOURCE))
+        scores += mine
         for outfit in outfits if config.floors else ():
             points = next(row.points for row in mine.rows if row.outfit == outfit.name)
-            path = floors_folder(floors_root(run, settings), settings.dataset, outfit.name, points)
-            floors[outfit.name, points] = score_floors(outfit, config, points, scores_file(path, config.split))
+            path = floors_folder(floors_root(run, avatar.config), avatar.config.dataset, outfit.name, points)
+            floors[outfit.name, points] = score_floors(outfit, config, points, scores_file(path, split))
     for (name, points), found in floors.items():
         scores = found + scores if points == common_points(scores.rows, name) else scores
     return scores
+
+
+def label_of(avatar: TrainedAvatar, **more: str) -> Label:
+    """Who made a run's predictions: the columns that its scores begin with."""
+    settings = avatar.config
+    return Label(
+        settings.method.variant,
+        variant=variant_of(settings),
+        seed=settings.train.seed,
+        steps=avatar.steps,
+        seconds=avatar.seconds,
+        commit=current_commit(),
+        fraction=settings.split.train_fraction,
+        **more,
+    )
 
 
 def variant_of(config: RunConfig) -> str:
@@ -202,29 +193,23 @@ def variant_of(config: RunConfig) -> str:
 
 
 def floors_root(run: Path, settings: RunConfig) -> Path:
-    """Where the floors of a run's outfits go: the root that it lies in, or its own folder if it was moved.
-
-    What a run's file says of its root is the word of whoever made it, and is believed only where it is true.
-    """
+    """Where the floors of a run's outfits go: the root that its file names, if it lies there, else its own folder."""
     return settings.runs_root if settings.folder.resolve() == run.resolve() else run
 
 
 def score_floors(outfit: Outfit, config: EvaluateConfig, points: int, path: Path) -> Scores:
-    """The sampling floor and the bare body for one outfit at a point count, kept in a file for the next method.
-
-    Metrics that the file has already stay in it where they were made with the same points, seed, scanner, data and
-    code. Two processes that want the same floors score them once: the second waits for the first.
+    """The sampling floor and the bare body for one outfit at a point count, kept in a file for the next method. Metrics
+    that the file has of the same points, seed, scanner, data and code stay in it. Another process that wants the same
+    floors waits for them.
     """
-    memory = remember_scores(None, "floors", outfit, config.split, config.score, points=points)
+    memory = scoring.remember_points(None, "floors", outfit, config.split, config.score, points=points)
     key = digest_of([memory.made_of(name) for name in outfit.frames(config.split)])
     with lock_folder(path.parent, wait=True):
         ledger = Ledger(path.parent)
-        made = {"points": points, "commit": current_commit(), "ledger": ledger}
-        scores = score_sampling_floor(outfit, config.split, config.score, **made)
-        scores = scores + score_body_floor(outfit, config.split, config.score, **made)
+        scores = scoring.measure_floors(outfit, config.split, config.score, points, current_commit(), ledger)
         kept = read_scores(path) if ledger.find(path.name, key) else Scores()
         others = {row.metric for row in kept.rows} - set(config.score.metrics)
-        save_scores(path, kept.of_metrics(others) + scores, ledger, key)
+        save_scores(path, kept.only("metric", others) + scores, ledger, key)
     return scores
 
 
@@ -258,26 +243,21 @@ def are_current(path: Path) -> bool:
     return Ledger(path.parent).find(path.name, keyed(SOURCE)) is not None
 
 
-def print_tables(scores: Scores) -> None:
-    """Prints every metric of every outfit, and the excess over the sampling floor where floors were scored."""
-    rows = by_split(scores.rows)
-    for outfit in dict.fromkeys(row.outfit for row in rows):
-        print(to_markdown(metric_table(rows, outfit)))
-    if "sampling" in {row.method for row in rows}:
-        print(to_markdown(outfit_table(rows, "cd_point", View.EXCESS)))
-
-
-def read_all_scores(paths: Iterable[Path]) -> Scores:
-    """Scores of several files, joined."""
-    return sum(map(read_scores, paths), Scores())
+def score_tables(rows: Sequence[Score]) -> list[Table]:
+    """Every metric of every outfit, split by split, and the excess over the sampling floor where it was scored."""
+    found = []
+    for split in dict.fromkeys(row.split for row in rows):
+        mine = by_split(row for row in rows if row.split == split)
+        found += [metric_table(mine, outfit) for outfit in dict.fromkeys(row.outfit for row in mine)]
+        if ("sampling", "cd_point") in {(row.method, row.metric) for row in mine}:
+            found.append(outfit_table(mine, "cd_point", View.EXCESS))
+    return found
 
 
 def current_commit() -> str:
     """The short hash of the code's commit, or nothing outside a checkout."""
-    here = Path(__file__).parent
-    command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--exclude", "*"]
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"]
     try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return ""
-    return result.stdout.strip() if result.returncode == 0 else ""

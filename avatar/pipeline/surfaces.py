@@ -50,13 +50,10 @@ class ExportConfig:
 
 @prepared_process()
 def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
-    """Meshes the predictions of every outfit of a run into ``<run>/meshes/<split>/<outfit>``.
-
-    Raises:
-        AvatarError: after all frames, naming those that could not be meshed.
+    """Meshes the predictions of every outfit of a run into ``<run>/meshes/<split>/<outfit>``. Frames that could not be
+    meshed are an `AvatarError` after all of them.
     """
-    reports = {}
-    avatar = load_avatar(config.run)
+    avatar, reports = load_avatar(config.run), {}
     for name in avatar.config.outfit:
         folder = predictions_folder(config.run, config.predictions, name)
         if not folder.is_dir():
@@ -67,8 +64,7 @@ def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
             reports[target] = MeshingReport(skipped=tuple(frames))
             continue
         reports[target] = mesh_folder(folder, target, config.formats, frames, config.poisson)
-    failed = {frame: why for report in reports.values() for frame, why in report.failed.items()}
-    if failed:
+    if failed := {frame: why for report in reports.values() for frame, why in report.failed.items()}:
         frame, why = next(iter(failed.items()))
         raise AvatarError(f"{len(failed)} frames could not be meshed, the others were; {frame}: {why}")
     return reports
@@ -83,24 +79,18 @@ def spaced_frames(names: list[str], count: int | None) -> list[str]:
 
 @prepared_process()
 def export(config: ExportConfig) -> list[Path]:
-    """Writes ``<run>/export/<motion>/<outfit>/{points.usdc, meshes.usdc, body.glb, preview.webp}``.
-
-    Meshes are there when the sequence was meshed, joint tracks when its motion file is given. Frames are shown at the
-    times of their numbers. Several sequences (those of a split) have a folder each, ``<outfit>/<sequence>``.
+    """Writes ``<run>/export/<motion>/<outfit>/{points.usdc, meshes.usdc, body.glb, preview.webp}``. Meshes are there
+    when the sequence was meshed, joint tracks when its motion file is given. Frames are shown at the times of their
+    numbers. Several sequences (those of a split) have a folder each, ``<outfit>/<sequence>``.
     """
-    avatar, written = load_avatar(config.run), []
-    outfits = list(run_outfits(avatar, config.data_root))
-    bodies = [outfit.body for outfit in outfits]
-    rates = [
-        config.fps or predicted_fps(predictions_folder(config.run, config.predictions, outfit.name))
-        for outfit in outfits
-    ]
-    motions = [
-        read_body_motion(config.motion, body, fps, config.up) if config.motion and body is not None else None
-        for body, fps in zip(bodies, rates)
-    ]
-    for outfit, body, fps, motion in zip(outfits, bodies, rates, motions):
+    avatar, written, jobs = load_avatar(config.run), [], []
+    for outfit in run_outfits(avatar, config.data_root):
         folder = predictions_folder(config.run, config.predictions, outfit.name)
+        fps, motion = config.fps or predicted_fps(folder), None
+        if config.motion and outfit.body is not None:
+            motion = read_body_motion(config.motion, outfit.body, fps, config.up)
+        jobs.append((outfit, folder, fps, motion))
+    for outfit, folder, fps, motion in jobs:  # all motions were read by now
         meshes = meshes_folder(config.run, config.predictions, outfit.name)
         sequences = numbered_frames(path.stem for path in folder.glob("*.ply"))
         if not sequences:
@@ -109,18 +99,14 @@ def export(config: ExportConfig) -> list[Path]:
         for name, frames in sequences.items():
             place = target if len(sequences) == 1 else target / check_name("sequence", name)
             written += export_sequence(folder, meshes, frames, fps, place)
-        if body is not None:
-            write_rigged_glb(target / "body.glb", body, motion)
+        if outfit.body is not None:
+            write_rigged_glb(target / "body.glb", outfit.body, motion)
             written.append(target / "body.glb")
     return written
 
 
 def numbered_frames(names: Iterable[str]) -> dict[str, dict[int, str]]:
-    """Frames ``<sequence>.<number>`` as sequence, number and name, each in order; those without a number are counted.
-
-    Raises:
-        AvatarError: when two frames of a sequence have one number.
-    """
+    """Frames ``<sequence>.<number>`` as sequence, number and name, in order; those without a number are counted."""
     sequences: dict[str, dict[int, str]] = {}
     for place, name in enumerate(sorted(names)):
         sequence, _, digits = name.rpartition(".")
@@ -141,7 +127,8 @@ def export_sequence(folder: Path, meshes: Path, frames: dict[int, str], fps: flo
     write_animation(target / "preview.webp", images, fps, list(clouds))
     surfaces = {number: meshes / f"{name}.ply" for number, name in frames.items()}
     surfaces = {number: path for number, path in surfaces.items() if path.is_file()}
+    made = ["points.usdc", "preview.webp"]
     if surfaces:
         write_usd_meshes(target / "meshes.usdc", map(read_mesh, surfaces.values()), fps, list(surfaces))
-    written = [target / name for name in ("points.usdc", "preview.webp")]
-    return written + ([target / "meshes.usdc"] if surfaces else [])
+        made.append("meshes.usdc")
+    return [target / name for name in made]

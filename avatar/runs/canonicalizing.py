@@ -9,27 +9,21 @@ import torch
 
 from avatar.body.packed import write_template
 from avatar.canonical.canonicalizer import Canonicalizer
-from avatar.canonical.posed import prepare_scan
-from avatar.canonical.scans import KNN, NearestBody, SkinningSource, canonicalize_scan
+from avatar.canonical.fields import KNN, BodyField
+from avatar.canonical.scans import canonicalize_scan, prepare_scan
 from avatar.checks import DataError
 from avatar.data.batches import FrameDataset, LruSequence
 from avatar.data.validation import check_frame_count
 from avatar.environment import choose_device, prepared_process
-from avatar.io.canonical_scans import write_canonical_scan
 from avatar.io.checkpoints import read_weights, write_weights
+from avatar.io.frames import write_canonical_scan
 from avatar.io.ledger import Ledger, digest_of, file_digest, keyed, module_digest
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
-from avatar.methods.canonicalizer import (
-    POSES,
-    WEIGHTS,
-    CanonicalizeConfig,
-    CanonicalizerTask,
-    WeightSource,
-    load_canonicalizer,
-)
+from avatar.methods import canonicalizer
+from avatar.methods.canonicalizer import CanonicalizeConfig, SkinningSource, WeightSource
 from avatar.progress import tracked
-from avatar.records import CanonicalScan, Mesh, PointCloud, Template
+from avatar.records import Mesh, PointCloud, Template
 from avatar.runs.training import save_settings
 from avatar.settings import settings_to_dict
 from avatar.training.trainer import Trainer, spent
@@ -60,18 +54,19 @@ def train_canonicalizer(config: CanonicalizeConfig, frames: FrameDataset | None 
     scans = LruSequence(lambda place: prepare(frames.frame(learned[place])), len(learned))
     torch.manual_seed(config.train.seed)
     model = Canonicalizer(template, len(scans), config.canonicalizer).to(choose_device(config.device))
-    trainer = Trainer(CanonicalizerTask(model, template, scans, names, config.train), config.train, config.folder)
+    task = canonicalizer.CanonicalizerTask(model, template, scans, names, config.train)
+    trainer = Trainer(task, config.train, config.folder)
     trainer.fit()
     poses = torch.stack([scan.joint_transforms for scan in scans])
     facts = {"config": settings_to_dict(config), "frames": names, "steps": trainer.step, "seconds": trainer.seconds}
-    write_weights(config.folder / WEIGHTS, model.state_dict() | {POSES: poses}, facts)
+    write_weights(config.folder / canonicalizer.WEIGHTS, model.state_dict() | {canonicalizer.POSES: poses}, facts)
     return config.folder
 
 
 def is_trained(config: CanonicalizeConfig) -> bool:
     """Whether a run's canonicalizer is there, valid and trained to its end."""
     try:
-        facts = read_weights(config.folder / WEIGHTS, ("steps", "seconds"))[1]
+        facts = read_weights(config.folder / canonicalizer.WEIGHTS, ("steps", "seconds"))[1]
         return spent(config.train, int(facts["steps"]), float(facts["seconds"])) >= 1
     except DataError:
         return False
@@ -87,8 +82,7 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
     frames = frames or config.frames()
     template = frames.outfits[0].template
     source, made_by = skinning_source(config, template), scans_digest(config)
-    done = Ledger(config.folder / "scans")
-    written = []
+    written, done = [], Ledger(config.folder / "scans")
     for index, where in enumerate(tracked(frames.names, "canonicalize", unit="scan")):
         path = config.folder / "scans" / where.split / f"{where.name}.npz"
         written.append(path)
@@ -102,7 +96,10 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
         files = [path]
         if where.split == "train":
             files.append(path.with_suffix(".ply"))
-            write_surface(files[-1], scan)
+            if scan.faces is None:
+                write_points(files[-1], PointCloud(scan.points, scan.normals))
+            else:
+                write_mesh(files[-1], Mesh(scan.points, scan.faces, scan.colors))
         write_canonical_scan(path, scan)
         done.record(name, key, files)
     return written
@@ -111,8 +108,8 @@ def canonicalize_frames(config: CanonicalizeConfig, frames: FrameDataset | None 
 def skinning_source(config: CanonicalizeConfig, template: Template) -> SkinningSource:
     """What gives a run's scans their weights: its trained canonicalizer, or the body nearby."""
     if config.weights is WeightSource.learned:
-        return load_canonicalizer(config.folder, config.device)
-    return NearestBody(template, KNN if config.weights is WeightSource.knn else 1)
+        return canonicalizer.load_canonicalizer(config.folder, config.device)
+    return BodyField(template, KNN if config.weights is WeightSource.knn else 1)
 
 
 def scans_digest(config: CanonicalizeConfig) -> str:
@@ -120,13 +117,5 @@ def scans_digest(config: CanonicalizeConfig) -> str:
     plain = settings_to_dict(config)
     parts = {key: plain[key] for key in ("weights", "scan", "stretch")}
     if config.weights is WeightSource.learned:
-        parts["learned"] = file_digest(config.folder / f"{WEIGHTS}.safetensors")
+        parts["learned"] = file_digest(config.folder / f"{canonicalizer.WEIGHTS}.safetensors")
     return keyed(SOURCE, program=module_digest(__name__), **parts)
-
-
-def write_surface(path: Path, scan: CanonicalScan) -> None:
-    """A canonical scan for other programs: a mesh where it is one, oriented points otherwise."""
-    if scan.faces is None:
-        write_points(path, PointCloud(scan.points, scan.normals))
-    else:
-        write_mesh(path, Mesh(scan.points, scan.faces, scan.colors))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,68 +35,25 @@ class Pose:
 def predict_frames(
     avatar: TrainedAvatar,
     outfit: Outfit,
-    split: str,
-    folder: Path,
-    meshes: Path,
-    points: int,
-    surface: ExtractionConfig | None = None,
-    keep: Callable[[str], bool] = bool,
-) -> list[Path]:
-    """Writes ``<folder>/<frame>.ply`` for those frames of a split that are to ``keep``; gives the files in order.
-
-    ``outfit`` is one of those the avatar was trained on, ``points`` a frame are 1,000 to 400,000. A method with a
-    surface, of the resolution ``surface``, writes that to ``<meshes>/<frame>.ply``.
-    """
-    poses = [
-        Pose(name, lambda name=name: outfit.load(split, name).body, outfit.digest(split, name))
-        for name in outfit.frames(split)
-        if keep(name)
-    ]
-    return predict_poses(avatar, outfit.name, poses, folder, meshes, points, surface)
-
-
-@prepared_process()
-def predict_motion(
-    avatar: TrainedAvatar,
-    outfit: Outfit,
-    motion: Motion,
+    frames: str | Motion,
     folder: Path,
     meshes: Path,
     points: int,
     surface: ExtractionConfig | None = None,
 ) -> list[Path]:
-    """Writes ``<folder>/<motion>.<frame>.ply`` for every frame of a motion; see `predict_frames`.
+    """Writes ``<folder>/<frame>.ply`` for all frames of a split, or of a motion; gives the files in order.
 
-    Points of a point method keep their order over time.
+    ``outfit`` is one of those the avatar was trained on, ``points`` a frame are 1,000 to 400,000; those of a point
+    method keep their order over time. A method with a surface, of the resolution ``surface``, writes that to
+    ``<meshes>/<frame>.ply``. Predictions of the same avatar and bodies whose hashes are still right stay.
     """
-    check_shape("poses", motion.poses, "T J 3", J=len(outfit.posable_body().parents))
-    poses = [
-        Pose(
-            f"{motion.name}.{frame:05d}",
-            lambda frame=frame: outfit.fit_pose(motion.poses[frame], motion.translations[frame]),
-            digest_of([motion.poses[frame].tolist(), motion.translations[frame].tolist(), outfit.shared_digest]),
-        )
-        for frame in range(len(motion.poses))
-    ]
-    return predict_poses(avatar, outfit.name, poses, folder, meshes, points, surface)
-
-
-def predict_poses(
-    avatar: TrainedAvatar,
-    outfit: str,
-    poses: Iterable[Pose],
-    folder: Path,
-    meshes: Path,
-    points: int,
-    surface: ExtractionConfig | None,
-) -> list[Path]:
-    """Writes the predictions of poses; those of the same avatar and bodies whose hashes are still right stay."""
     surface = surface or ExtractionConfig()
-    dress = avatar.method.predictor(avatar, outfit, points, surface)
+    dress = avatar.method.predictor(avatar, outfit.name, points, surface)
     made = {"avatar": avatar_digest(avatar), **avatar.method.prediction_settings(points, surface)}
     source = (*SOURCE, *avatar.method.sources)
+    poses = motion_poses(outfit, frames) if isinstance(frames, Motion) else split_poses(outfit, frames)
     written, done = [], Ledger(folder)
-    for pose in tracked(list(poses), f"predict {outfit}"):
+    for pose in tracked(poses, f"predict {outfit.name}"):
         path, key = folder / f"{pose.name}.ply", keyed(source, **made, body=pose.digest)
         written.append(path)
         if done.find(pose.name, key):
@@ -108,6 +65,28 @@ def predict_poses(
         write_points(path, dressed.cloud)
         done.record(pose.name, key, files)
     return written
+
+
+def split_poses(outfit: Outfit, split: str) -> list[Pose]:
+    """The poses of a split's frames."""
+    return [
+        Pose(name, lambda name=name: outfit.load(split, name).body, outfit.digest(split, name))
+        for name in outfit.frames(split)
+    ]
+
+
+def motion_poses(outfit: Outfit, motion: Motion) -> list[Pose]:
+    """The poses of a motion's frames, which are named ``<motion>.<frame>``."""
+    dims = check_shape("poses", motion.poses, "T J 3", J=len(outfit.posable_body().parents))
+    check_shape("translations", motion.translations, "T 3", T=dims["T"])
+    return [
+        Pose(
+            f"{motion.name}.{frame:05d}",
+            lambda pose=pose, translation=translation: outfit.fit_pose(pose, translation),
+            digest_of([pose.tolist(), translation.tolist(), outfit.shared_digest]),
+        )
+        for frame, (pose, translation) in enumerate(zip(motion.poses, motion.translations))
+    ]
 
 
 def avatar_digest(avatar: TrainedAvatar) -> str:

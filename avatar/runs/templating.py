@@ -24,8 +24,8 @@ from avatar.canonical.clothed import (
     template_facts,
     weigh_garment,
 )
-from avatar.canonical.posed import root_joint_transforms, to_root_frame
 from avatar.canonical.refinement import PosedPoints
+from avatar.canonical.scans import root_joint_transforms, to_root_frame
 from avatar.canonical.skin import SkinVote
 from avatar.checks import AvatarError, DataError, check_name
 from avatar.data.batches import LruSequence
@@ -33,8 +33,8 @@ from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
 from avatar.environment import prepared_process
 from avatar.invocation import command_line
-from avatar.io.canonical_scans import read_canonical_scan
 from avatar.io.clothed_templates import write_clothed_template
+from avatar.io.frames import read_canonical_scan
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.locks import lock_folder
 from avatar.io.meshes import write_mesh

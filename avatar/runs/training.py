@@ -62,16 +62,12 @@ def save_settings(config: RunConfig) -> None:
     The budget (``train.steps``, ``train.minutes``) and bookkeeping may change between the two. Raises `AvatarError`
     naming the options that differ.
     """
-    path = config.folder / "config.yaml"
-    plain = settings_to_dict(config)
+    path, plain = config.folder / "config.yaml", settings_to_dict(config)
     if path.is_file():
-        before = flatten(read_yaml(path))
-        now = flatten(plain)
+        before, now = {"train.clock": "wall"} | flatten(read_yaml(path)), flatten(plain)  # older runs name no clock
         free = {"train.steps", "train.minutes", "train.save_every", "train.log_every", "device", "data_root"}
         free |= {"pictures", "scored"}  # of canonicalizers' runs
-        changed = [key for key in sorted(before.keys() | now.keys()) if before.get(key) != now.get(key)]
-        changed = [key for key in changed if key not in free]
-        if changed:
+        if changed := [key for key in sorted((before | now).keys() - free) if before.get(key) != now.get(key)]:
             raise AvatarError(
                 f"{path}: this run was begun with other settings ({', '.join(changed[:5])}). "
                 "Give the new one another name (name=...), or delete the folder."
@@ -89,12 +85,10 @@ def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def mean_template(templates: list[Template]) -> Template:
     """The template a network is built on: the outfits' mean body where they differ in shape."""
-    first = templates[0]
-    if any(not torch.equal(template.faces, first.faces) for template in templates):
+    if any(not torch.equal(template.faces, templates[0].faces) for template in templates):
         raise AvatarError("outfit: expected bodies of one topology in a run, got several.")
-    vertices = torch.stack([template.vertices for template in templates]).mean(dim=0)
-    joints = torch.stack([template.joints for template in templates]).mean(dim=0)
-    return replace(first, vertices=vertices, joints=joints)
+    mean = {name: torch.stack([getattr(t, name) for t in templates]).mean(dim=0) for name in ("vertices", "joints")}
+    return replace(templates[0], **mean)
 
 
 def load_avatar(folder: Path, checkpoint: str = "last", device: str = "auto") -> TrainedAvatar:
@@ -117,13 +111,8 @@ def load_avatar(folder: Path, checkpoint: str = "last", device: str = "auto") ->
     return TrainedAvatar(method, settings, model.to(choose_device(device)).eval(), template, config, steps, seconds)
 
 
-def choose_weights(
-    folder: Path, checkpoint: str, last: dict[str, Tensor], facts: dict[str, Any]
-) -> tuple[dict[str, Tensor], int, float]:
-    """Weights, steps and seconds of a run: the ``last``, which are given, or those of its ``best`` checkpoint.
-
-    Raises `DataError` for the best of a run that held no frames back.
-    """
+def choose_weights(folder: Path, checkpoint: str, last: dict, facts: dict) -> tuple[dict[str, Tensor], int, float]:
+    """Weights, steps and seconds of a run: the ``last``, which are given, or those of its ``best`` checkpoint."""
     if checkpoint == "last":
         return last, int(facts["steps"]), float(facts["seconds"])
     state = load_checkpoint(folder / "checkpoints", "best")

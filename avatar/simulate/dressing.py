@@ -5,21 +5,24 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from avatar.body.model import BodyModel
+from avatar.body.open import open_body
+from avatar.body.packed import packed_body
 from avatar.body.skinning import blend_transforms
-from avatar.checks import AvatarError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_finite, check_shape
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import axis_angle_from_rotation, rotation_from_axis_angle, transform_points
 from avatar.geometry.trees import build_tree
 from avatar.simulate.garments import Garment, cut_garment
-from avatar.simulate.implicit import smoothing_matrix
-from avatar.simulate.layering import lift_off, tuck
+from avatar.simulate.level_sets import smoothing_matrix
+from avatar.simulate.mesh_queries import lift_off, tuck
 from avatar.simulate.outfits import OutfitConfig
-from avatar.simulate.solver import ClothSolver, Collider, SolverConfig
+from avatar.simulate.solver import ClothSolver, SolverConfig
 
 CLING_GAP = (0.02, 0.045)  # m between cloth and skin over which its cling to the skin fades out
 WAISTBAND_STIFFNESS = 3.0  # N/m a vertex: an elastic waistband stays where it is put
@@ -41,26 +44,25 @@ class TravelConfig:
 
 @dataclass(frozen=True)
 class Layer:
-    """A garment on its body: anchor weights ``(V, J)`` and stiffness ``(V,)``, and what lies under it.
+    """A garment on its body: its ``solver`` and anchor weights ``(V, J)``.
 
-    ``lift (V,)`` is how far the body's vertices move out to make room for inner garments, metres; ``part`` are
-    the garment's vertices among those of the outfit.
+    ``lift (V,)`` is how far the body's vertices move out for the inner garments, metres; ``part`` are the garment's
+    vertices among those of the outfit.
     """
 
     garment: Garment
+    solver: ClothSolver
     weights: torch.Tensor
-    stiffness: np.ndarray
     lift: torch.Tensor
     part: slice
 
 
 @dataclass(frozen=True)
 class Rest:
-    """Cloth at the end of a travel: ``cloth (V, 3)`` metres, ``speed`` m a step (99th percentile), ``steps`` taken."""
+    """Cloth at the end of a travel: ``cloth (V, 3)`` metres, ``speed`` m a step (99th percentile)."""
 
     cloth: np.ndarray
     speed: float
-    steps: int
 
 
 def bind_pose(body: BodyModel) -> np.ndarray:
@@ -80,62 +82,60 @@ def pose_path(start: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
     return axis_angle_from_rotation(a @ rotation_from_axis_angle(eased[:, None, None] * turn)).float().numpy()
 
 
+def subject(shape: str) -> BodyModel:
+    """The open body in one of its shapes, or a body of its topology from a file of tools/make_body.py.
+
+    Raises `DataError` for a damaged file or a body of another topology.
+    """
+    if not shape.endswith(".npz"):
+        return open_body(shape)
+    body = packed_body(Path(shape))
+    if not torch.equal(body.faces, open_body().faces):
+        raise DataError(Path(shape), "faces: expected those of the open body.", "Make it with tools/make_body.py.")
+    return body
+
+
 class DressedBody:
     """A body in an outfit, with everything prepared that does not depend on the pose."""
 
-    def __init__(self, body: BodyModel, outfit: OutfitConfig, travel: TravelConfig | None = None):
+    def __init__(self, outfit: OutfitConfig, travel: TravelConfig | None = None):
         """Cuts the garments, settles them in the bind pose and keeps that as the start of every travel."""
-        self.body, self.outfit, self.travel = body, outfit, travel or TravelConfig()
-        self.garments = [cut_garment(body, config) for config in outfit.garments]
+        self.body, self.outfit, self.travel = subject(outfit.shape), outfit, travel or TravelConfig()
+        self.garments = [cut_garment(self.body, config) for config in outfit.garments]
         sizes = [len(g.vertices) for g in self.garments]
         self.offsets = np.concatenate([[0], np.cumsum(sizes)])
         self.faces = np.concatenate([g.faces + o for g, o in zip(self.garments, self.offsets)])
         self.labels = np.repeat(np.arange(1, len(sizes) + 1), sizes).astype(np.uint8)
-        self.start_pose = bind_pose(body)
+        self.start_pose = bind_pose(self.body)
         self.layers = self.make_layers()
-        self.solvers = None
         self.start = np.concatenate([g.vertices for g in self.garments])
-        self.start = self.run(self.start_pose[None], self.travel.hold).cloth
+        self.start = self.run(self.start_pose[None]).cloth
 
     def make_layers(self) -> list[Layer]:
-        """Anchors and colliders of all garments, the innermost first."""
+        """Anchors, colliders and solvers of all garments, the innermost first."""
         vertices, faces = self.body.bind_vertices.numpy(), self.body.faces.numpy()
         lift = np.zeros(len(vertices))
         spread, _ = smoothing_matrix(faces, len(vertices))
         layers = []
         for garment, start in zip(self.garments, self.offsets):
-            gap, ids = build_tree(vertices).query(garment.vertices)
-            average, _ = smoothing_matrix(garment.faces, len(garment.vertices))
+            config, points = garment.config, garment.vertices
+            gap, ids = build_tree(vertices).query(points)
+            average, rim = smoothing_matrix(garment.faces, len(points))
             weights = self.body.weights.numpy()[ids].astype(np.float64)
             for _ in range(5):
                 weights = 0.5 * weights + 0.5 * (average @ weights)
-            fade = np.clip((CLING_GAP[1] - gap) / (CLING_GAP[1] - CLING_GAP[0]), 0, 1)
-            stiffness = garment.config.cling * fade
-            if garment.config.waistband:
-                top = garment.vertices[:, 1].max()
-                stiffness[garment.vertices[:, 1] > top - garment.config.waistband] = WAISTBAND_STIFFNESS
-            part = slice(int(start), int(start) + len(garment.vertices))
-            room = torch.from_numpy(lift.copy()).float()
-            layers.append(Layer(garment, torch.from_numpy(weights).float(), stiffness, room, part))
-            lift = lift + garment.config.room * covered_skin(vertices, garment)
+            stiffness = config.cling * np.clip((CLING_GAP[1] - gap) / (CLING_GAP[1] - CLING_GAP[0]), 0, 1)
+            if config.waistband:
+                stiffness[points[:, 1] > points[:, 1].max() - config.waistband] = WAISTBAND_STIFFNESS
+            solver = ClothSolver(points, garment.faces, config.fabric, vertices, faces, stiffness, self.travel.solver)
+            part = slice(int(start), int(start) + len(points))
+            lifted = torch.from_numpy(lift).float()
+            layers.append(Layer(garment, solver, torch.from_numpy(weights).float(), lifted, part))
+            away, nearest = build_tree(points).query(vertices)
+            lift = lift + config.bulk * ((away < COVERED_GAP) & ~rim[nearest])
             for _ in range(10):
                 lift = spread @ lift
         return layers
-
-    def make_solvers(self) -> list[ClothSolver]:
-        """A solver a layer, compiled and allocated once."""
-        vertices, faces = self.body.bind_vertices.numpy(), self.body.faces.numpy()
-        return [
-            ClothSolver(
-                layer.garment.vertices,
-                layer.garment.faces,
-                layer.garment.config.fabric,
-                Collider(vertices, faces),
-                layer.stiffness,
-                self.travel.solver,
-            )
-            for layer in self.layers
-        ]
 
     def under(self, layer: Layer, body_points: torch.Tensor) -> np.ndarray:
         """What a layer rests on: posed body vertices ``(T, V, 3)``, moved out where inner garments lie."""
@@ -149,18 +149,15 @@ class DressedBody:
         return self.body(torch.as_tensor(poses, dtype=torch.float32)).vertices.numpy()
 
     def settle(self, pose: np.ndarray, stride: float | None = None, via: Sequence[np.ndarray] = ()) -> Rest:
-        """The outfit at rest in a pose, reached from the bind pose, directly or by way of other poses.
+        """The outfit at rest in a pose ``(J, 3)``, reached from the bind pose, by way of the poses ``via`` in order.
 
-        Args:
-            pose: ``(J, 3)`` axis-angle target.
-            stride: farthest way of any body vertex in one step, metres; the configured one if None.
-            via: poses to pass, in order.
+        No body vertex moves farther than ``stride`` metres in one step; the configured one if None. Raises
+        `AvatarError` for a pose of another shape or not finite, and where the solver diverges.
         """
         check_shape("pose", pose, "J 3", J=len(self.body.parents))
         check_finite("pose", pose)
-        stops = [self.start_pose, *via, pose]
-        legs = [self.leg(a, b, stride or self.travel.stride) for a, b in itertools.pairwise(stops)]
-        return self.run(np.concatenate(legs), self.travel.hold)
+        stops = itertools.pairwise([self.start_pose, *via, pose])
+        return self.run(np.concatenate([self.leg(a, b, stride or self.travel.stride) for a, b in stops]))
 
     def leg(self, start: np.ndarray, end: np.ndarray, stride: float, least: int = 2) -> np.ndarray:
         """Poses from one stop to the next, as many as the farthest-moving vertex needs."""
@@ -168,22 +165,20 @@ class DressedBody:
         way = np.linalg.norm(np.diff(sketch, axis=0), axis=-1).max(1).sum()
         return pose_path(start, end, max(least, int(np.ceil(1.5 * way / stride))))
 
-    def run(self, poses: np.ndarray, hold: int) -> Rest:
+    def run(self, poses: np.ndarray) -> Rest:
         """Leads the outfit along poses, then holds the last one until the cloth rests, layer by layer."""
-        if self.solvers is None:
-            self.solvers = self.make_solvers()
         posed = self.body(torch.as_tensor(np.concatenate([self.start_pose[None], poses]), dtype=torch.float32))
         motions = posed.joint_transforms[1:] @ self.body.zero_from_bind
-        cloth, speed, steps = self.start.copy(), 0.0, 0
-        for layer, solver in zip(self.layers, self.solvers):
+        cloth, speed = self.start.copy(), 0.0
+        for layer in self.layers:
             under = self.under(layer, posed.vertices)
-            solver.reset(self.start[layer.part], under[0])
-            taken = self.follow(layer, solver, under[1:], motions, hold)
-            cloth[layer.part] = solver.positions
-            speed, steps = max(speed, float(np.percentile(solver.moved, 99))), max(steps, taken)
+            layer.solver.reset(self.start[layer.part], under[0])
+            self.follow(layer, under[1:], motions, self.travel.hold)
+            cloth[layer.part] = layer.solver.positions
+            speed = max(speed, float(np.percentile(layer.solver.moved, 99)))
         if not np.isfinite(cloth).all():
             raise AvatarError(f"outfit {self.outfit.name!r}: the solver diverged; use a smaller stride.")
-        return Rest(self.in_order(cloth, posed.vertices[-1].numpy()), speed, steps)
+        return Rest(self.in_order(cloth, posed.vertices[-1].numpy()), speed)
 
     def play(self, poses: np.ndarray) -> np.ndarray:
         """Cloth ``(T, V, 3)`` over a continuous motion ``(T, J, 3)``: settled in its first pose, then following."""
@@ -192,38 +187,29 @@ class DressedBody:
         self.settle(poses[0])
         legs = [poses[:1]] + [self.leg(a, b, self.travel.stride, PLAY_STEPS) for a, b in itertools.pairwise(poses)]
         cloth = np.zeros((len(poses), len(self.start), 3), np.float32)
-        for layer, solver in zip(self.layers, self.solvers):
+        for layer in self.layers:
             for frame, leg in enumerate(legs):
                 posed = self.body(torch.as_tensor(leg, dtype=torch.float32))
                 motions = posed.joint_transforms @ self.body.zero_from_bind
-                self.follow(layer, solver, self.under(layer, posed.vertices), motions, 0)
-                cloth[frame, layer.part] = solver.positions
+                self.follow(layer, self.under(layer, posed.vertices), motions)
+                cloth[frame, layer.part] = layer.solver.positions
         return np.stack([self.in_order(c, b) for c, b in zip(cloth, self.posed_body(poses))])
 
     def in_order(self, cloth: np.ndarray, body_points: np.ndarray) -> np.ndarray:
         """The outfit's cloth with inner garments under outer ones, outside the body."""
-        faces = self.body.faces.numpy()
         for above in range(len(self.layers) - 1, 0, -1):
             outer = self.layers[above]
             for inner in self.layers[:above]:
                 cloth[inner.part] = tuck(cloth[inner.part], cloth[outer.part], outer.garment.faces)
-        return lift_off(cloth, body_points, faces, LEAST_GAP)
+        return lift_off(cloth, body_points, self.body.faces.numpy(), LEAST_GAP)
 
-    def follow(self, layer: Layer, solver: ClothSolver, under: np.ndarray, motions: torch.Tensor, hold: int) -> int:
-        """Leads one layer through ``(T, V, 3)`` colliders and holds it at the last until it rests; counts steps."""
-        rest = torch.as_tensor(layer.garment.vertices, dtype=torch.float32)
+    def follow(self, layer: Layer, under: np.ndarray, motions: torch.Tensor, hold: int = 0) -> None:
+        """Leads one layer through colliders ``(T, V, 3)`` and holds it at the last until it rests."""
+        rest, solver = torch.as_tensor(layer.garment.vertices, dtype=torch.float32), layer.solver
         for points, motion in zip(under, motions):
             anchors = transform_points(blend_transforms(layer.weights, motion[None])[0], rest).numpy()
             solver.step(points, anchors)
         for held in range(hold):
             solver.step(under[-1], anchors, float(np.clip(2 - 2 * held / hold, 0.1, 1.0)))
             if held >= self.travel.least_hold and np.percentile(solver.moved, 99) < self.travel.rest_speed:
-                return len(under) + held + 1
-        return len(under) + hold
-
-
-def covered_skin(vertices: np.ndarray, garment: Garment) -> np.ndarray:
-    """Mask ``(V,)`` of body vertices that lie close under a garment."""
-    gap, ids = build_tree(garment.vertices).query(vertices)
-    _, rim = smoothing_matrix(garment.faces, len(garment.vertices))
-    return (gap < COVERED_GAP) & ~rim[ids]
+                break

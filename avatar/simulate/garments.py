@@ -12,20 +12,9 @@ from avatar.body.model import BodyModel
 from avatar.checks import AvatarError
 from avatar.geometry.transforms import invert_rigid, transform_points
 from avatar.geometry.trees import build_tree
-from avatar.simulate.implicit import (
-    Grid,
-    clip,
-    collapse_short_edges,
-    compact,
-    drop_ears,
-    flip_edges,
-    largest_component,
-    relax,
-    surface_nets,
-)
-from avatar.simulate.layering import lift_off
+from avatar.simulate import level_sets
+from avatar.simulate.mesh_queries import body_distances, lift_off
 from avatar.simulate.outfits import GarmentConfig
-from avatar.simulate.visibility import body_distances
 
 PAD = 0.12  # metres of free grid around the body
 SHORTEST = 0.45  # shortest edge in the finished mesh, in target edge lengths, before the last relaxation
@@ -39,30 +28,18 @@ LEVELS = ("left_ankle", "left_knee", "left_hip", "spine1", "spine3", "neck")
 ARM_JOINTS = ("shoulder", "elbow", "wrist")
 
 
-@dataclass(frozen=True)
 class Cutting:
-    """The body a garment is cut on: bind-pose ``vertices``, ``faces``, ``joints`` by name, weights ``(V,)`` of the
+    """The body a garment is cut on: bind-pose ``vertices``, ``faces``, ``joints`` by name, and weights ``(V,)`` of the
     ``arms`` and of the ``head``.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
-    joints: dict[str, np.ndarray]
-    arms: np.ndarray
-    head: np.ndarray
-
-    @classmethod
-    def of(cls, body: BodyModel) -> Cutting:
-        """The bind pose of a body."""
+    def __init__(self, body: BodyModel):
         joints = transform_points(invert_rigid(body.zero_from_bind), body.zero_joints).double().numpy()
         arm_ids = [body.joint_names.index(f"{side}_{j}") for side in ("left", "right") for j in ARM_JOINTS]
-        return cls(
-            body.bind_vertices.double().numpy(),
-            body.faces.numpy(),
-            dict(zip(body.joint_names, joints)),
-            body.weights[:, arm_ids].sum(dim=1).double().numpy(),
-            body.weights[:, body.joint_names.index("head")].double().numpy(),
-        )
+        self.vertices, self.faces = body.bind_vertices.double().numpy(), body.faces.numpy()
+        self.joints = dict(zip(body.joint_names, joints))
+        self.arms = body.weights[:, arm_ids].sum(dim=1).double().numpy()
+        self.head = body.weights[:, body.joint_names.index("head")].double().numpy()
 
     def height(self, level: float) -> float:
         """Height in metres of a level on the body (see `GarmentConfig`)."""
@@ -88,34 +65,30 @@ class Garment:
 
 
 def cut_garment(body: BodyModel, config: GarmentConfig) -> Garment:
-    """Cuts a garment on a body in its bind pose.
+    """Cuts a garment on a body in its bind pose: one connected, consistently wound mesh outside the body.
 
-    Returns:
-        One connected, consistently wound mesh with every vertex outside the body.
-
-    Raises:
-        AvatarError: when the settings leave nothing to wear.
+    Raises `AvatarError` when the settings leave nothing to wear.
     """
-    cutting = Cutting.of(body)
+    cutting = Cutting(body)
     grid = garment_field(cutting, config)
-    vertices, faces = surface_nets(grid)
-    vertices = relax(vertices, faces, grid, 6)
+    vertices, faces = level_sets.surface_nets(grid)
+    vertices = level_sets.relax(vertices, faces, grid, 6)
     nearest = build_tree(cutting.vertices)
     for cut in cuts(cutting, config):
         _, ids = nearest.query(vertices)
-        vertices, faces = clip(vertices, faces, cut(vertices, cutting.arms[ids]))
+        vertices, faces = level_sets.clip(vertices, faces, cut(vertices, cutting.arms[ids]))
         if not len(faces):
             raise AvatarError(f"garment {config.name!r}: the cuts leave nothing; check bottom, top and sleeve.")
-    vertices, faces = largest_component(vertices, faces)
-    vertices, faces = compact(vertices, drop_ears(faces))
+    vertices, faces = level_sets.largest_component(vertices, faces)
+    vertices, faces = level_sets.compact(vertices, level_sets.drop_ears(faces))
     for _ in range(3):
-        vertices, faces = collapse_short_edges(vertices, faces, SHORTEST * config.edge)
-        faces = flip_edges(vertices, faces)
-        vertices = relax(vertices, faces, grid, 8)
+        vertices, faces = level_sets.collapse_short_edges(vertices, faces, SHORTEST * config.edge)
+        faces = level_sets.flip_edges(vertices, faces)
+        vertices = level_sets.relax(vertices, faces, grid, 8)
     return Garment(config, lift_off(vertices, cutting.vertices, cutting.faces, config.fabric.thickness), faces)
 
 
-def garment_field(cutting: Cutting, config: GarmentConfig) -> Grid:
+def garment_field(cutting: Cutting, config: GarmentConfig) -> level_sets.Grid:
     """The signed field whose zero level is the uncut garment: the body with ease, melted into a hanging tube."""
     bottom = cutting.height(config.bottom)
     hip = cutting.height(2 if config.drop is None else config.drop)
@@ -141,7 +114,8 @@ def garment_field(cutting: Cutting, config: GarmentConfig) -> Grid:
         field = smooth_minimum(field, neck_tube(cutting, flat), BLEND)
     if config.drop is not None:
         field = smooth_minimum(field, hanging_tube(cutting, config, flat), BLEND)
-    return Grid(gaussian_filter(field.reshape(points.shape[:3]), BLUR / config.edge), low, config.edge)
+    blurred = gaussian_filter(field.reshape(points.shape[:3]), BLUR / config.edge)
+    return level_sets.Grid(blurred, low, config.edge)
 
 
 def crotch_fill(cutting: Cutting, points: np.ndarray) -> np.ndarray:
@@ -159,11 +133,9 @@ def hanging_tube(cutting: Cutting, config: GarmentConfig, points: np.ndarray) ->
     """Approximate signed distance of ``(N, 3)`` points to cloth hanging straight or flared from the drop level."""
     start, end = cutting.height(config.drop), cutting.height(config.bottom) - PAD
     heights = np.arange(start, end, -0.01)
-    profile = cutting.profile(heights)
-    low = cutting.height(0.3) < heights  # feet are no part of what cloth hangs over
-    widest = np.maximum.accumulate(np.where(low, profile[:, 0], 0))
-    back = np.minimum.accumulate(np.where(low, profile[:, 1], 0))
-    front = np.maximum.accumulate(np.where(low, profile[:, 2], 0))
+    feet = cutting.height(0.3) >= heights  # no part of what cloth hangs over
+    profile = np.where(feet[:, None], 0, cutting.profile(heights)) * (1, -1, 1)  # so that all three grow downwards
+    widest, back, front = np.maximum.accumulate(profile).T * np.array([[1], [-1], [1]])
     spread = config.ease + config.flare * (start - heights)
     at = [np.interp(-points[:, 1], -heights, row) for row in (widest + spread, back - spread, front + spread)]
     half_width, half_depth, centre = at[0], (at[2] - at[1]) / 2, (at[2] + at[1]) / 2
@@ -195,16 +167,15 @@ def cuts(cutting: Cutting, config: GarmentConfig) -> list:
     for side in ("left", "right"):
         chain = np.stack([cutting.joints[f"{side}_{joint}"] for joint in ARM_JOINTS])
         start = min(int(config.sleeve), 1)
-        along = (chain[start + 1] - chain[start]) / np.linalg.norm(chain[start + 1] - chain[start])
-        end = chain[start] + (config.sleeve - start) * (chain[start + 1] - chain[start])
+        bone = chain[start + 1] - chain[start]
+        end, along = chain[start] + (config.sleeve - start) * bone, bone / np.linalg.norm(bone)
 
         def sleeve(v, arm, end=end, along=along, outward=chain[0, 0]):
             return np.where((arm > 0.5) & (v[:, 0] * outward > 0), (v - end) @ along, -1.0)
 
         made.append(sleeve)
     if config.opening:
-        half = config.opening / 2
-        depth = cutting.joints["neck"][2]
+        half, depth = config.opening / 2, cutting.joints["neck"][2]
         made.append(lambda v, arm: np.where((arm < 0.5) & (v[:, 2] > depth), half - np.abs(v[:, 0]), -1.0))
     return made
 

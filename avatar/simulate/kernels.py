@@ -5,9 +5,11 @@ A module of its own because warp compiles a module as a whole, again after every
 
 import warp as wp
 
+Floats, Vectors, Matrices, Flags = (wp.array(dtype=kind) for kind in (float, wp.vec3, wp.mat33, wp.uint8))
+
 
 @wp.kernel
-def signed_distances(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: float, distances: wp.array(dtype=float)):
+def signed_distances(mesh: wp.uint64, points: Vectors, reach: float, distances: Floats):
     """Distance of each point to a closed mesh, negative inside; ``reach`` where nothing is nearer."""
     i = wp.tid()
     query = wp.mesh_query_point_sign_normal(mesh, points[i], reach)
@@ -19,12 +21,7 @@ def signed_distances(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: fl
 
 @wp.kernel
 def find_contacts(
-    mesh: wp.uint64,
-    positions: wp.array(dtype=wp.vec3),
-    reach: float,
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    drifts: wp.array(dtype=wp.vec3),
+    mesh: wp.uint64, positions: Vectors, reach: float, points: Vectors, normals: Vectors, drifts: Vectors
 ):
     """Nearest collider point of each particle, the outward direction there and how far it moved this step.
 
@@ -47,19 +44,19 @@ def find_contacts(
 
 @wp.kernel
 def push_apart(
-    positions: wp.array(dtype=wp.vec3),
-    previous: wp.array(dtype=wp.vec3),
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    drifts: wp.array(dtype=wp.vec3),
-    anchors: wp.array(dtype=wp.vec3),
-    anchor_stiffness: wp.array(dtype=float),
-    thickness: wp.array(dtype=float),
-    friction: wp.array(dtype=float),
+    positions: Vectors,
+    previous: Vectors,
+    points: Vectors,
+    normals: Vectors,
+    drifts: Vectors,
+    anchors: Vectors,
+    anchor_stiffness: Floats,
+    thickness: float,
+    friction: float,
     stiffness: float,
     creep: float,
-    forces: wp.array(dtype=wp.vec3),
-    hessians: wp.array(dtype=wp.mat33),
+    forces: Vectors,
+    hessians: Matrices,
 ):
     """Adds anchor springs, contact and lagged Coulomb friction (smooth below ``creep`` metres a step)."""
     i = wp.tid()
@@ -67,12 +64,12 @@ def push_apart(
     force = anchor_stiffness[i] * (anchors[i] - x)
     hessian = wp.identity(n=3, dtype=float) * anchor_stiffness[i]
     normal = normals[i]
-    depth = thickness[i] - wp.dot(x - points[i], normal)
+    depth = thickness - wp.dot(x - points[i], normal)
     if wp.length_sq(normal) > 0.5 and depth > 0.0:
         across = wp.outer(normal, normal)
         slip = x - previous[i] - drifts[i]
         slip -= wp.dot(slip, normal) * normal
-        drag = friction[i] * stiffness * depth / wp.max(wp.length(slip), creep)
+        drag = friction * stiffness * depth / wp.max(wp.length(slip), creep)
         force += stiffness * depth * normal - drag * slip
         hessian += stiffness * across + drag * (wp.identity(n=3, dtype=float) - across)
     forces[i] += force
@@ -80,33 +77,25 @@ def push_apart(
 
 
 @wp.kernel
-def keep_outside(
-    positions: wp.array(dtype=wp.vec3),
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    thickness: wp.array(dtype=float),
-    steps: wp.array(dtype=wp.vec3),
-):
+def keep_outside(positions: Vectors, points: Vectors, normals: Vectors, thickness: float, steps: Vectors):
     """Shortens the solver's step so that no particle ends nearer to its contact plane than half the thickness."""
     i = wp.tid()
     normal = normals[i]
     if wp.length_sq(normal) > 0.5:
         height = wp.dot(positions[i] + steps[i] - points[i], normal)
-        steps[i] += wp.max(0.5 * thickness[i] - height, 0.0) * normal
+        steps[i] += wp.max(0.5 * thickness - height, 0.0) * normal
 
 
 @wp.kernel
-def apply_hessian(
-    hessians: wp.array(dtype=wp.mat33), vectors: wp.array(dtype=wp.vec3), products: wp.array(dtype=wp.vec3)
-):
+def apply_hessian(hessians: Matrices, vectors: Vectors, products: Vectors):
     """Product of each particle's 3x3 block with its vector."""
     i = wp.tid()
     products[i] = hessians[i] * vectors[i]
 
 
 @wp.kernel
-def extrapolate(positions: wp.array(dtype=wp.vec3), last: wp.array(dtype=wp.vec3), momentum: float, longest: float):
-    """Carries each particle on by a share of its last step, at most ``longest`` metres; remembers where it was."""
+def extrapolate(positions: Vectors, last: Vectors, momentum: float, longest: float):
+    """Moves each particle on by a share of its last step, at most ``longest`` metres; remembers where it was."""
     i = wp.tid()
     x = positions[i]
     way = momentum * (x - last[i])
@@ -115,20 +104,14 @@ def extrapolate(positions: wp.array(dtype=wp.vec3), last: wp.array(dtype=wp.vec3
 
 
 @wp.kernel
-def hold_back(positions: wp.array(dtype=wp.vec3), last: wp.array(dtype=wp.vec3), share: float):
+def hold_back(positions: Vectors, last: Vectors, share: float):
     """Goes only a share of the way from the last positions, so that contacts that push in turns come to rest."""
     i = wp.tid()
     positions[i] = last[i] + share * (positions[i] - last[i])
 
 
 @wp.kernel
-def tuck_under(
-    mesh: wp.uint64,
-    normals: wp.array(dtype=wp.vec3),
-    gap: float,
-    reach: float,
-    points: wp.array(dtype=wp.vec3),
-):
+def tuck_under(mesh: wp.uint64, normals: Vectors, gap: float, reach: float, points: Vectors):
     """Moves points that lie above a cloth, or less than ``gap`` under it, to ``gap`` under it.
 
     ``normals`` are the cloth's vertex normals. Points beside the cloth, whose nearest point is on its rim, stay.
@@ -149,14 +132,7 @@ def tuck_under(
 
 
 @wp.kernel
-def see_faces(
-    mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    views: wp.array(dtype=wp.vec3),
-    lift: float,
-    seen: wp.array(dtype=wp.uint8),
-):
+def see_faces(mesh: wp.uint64, origins: Vectors, normals: Vectors, views: Vectors, lift: float, seen: Flags):
     """Marks faces seen from their front by an orthographic camera: a ray towards it meets nothing."""
     i = wp.tid()
     for k in range(views.shape[0]):

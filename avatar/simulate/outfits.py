@@ -45,7 +45,7 @@ class GarmentConfig:
     neck: float = 0.0  # m by which the neckline is lowered
     edge: float = 0.018  # m, target edge length
     waistband: float = 0.0  # m of elastic band under the upper edge
-    room: float = 0.012  # m that it and its small folds add to the body under the next garment
+    bulk: float = 0.012  # m that it and its small folds add to the body under the next garment
     cling: float = 0.02  # N/m a vertex: elastic pull to its place on the skin where the cloth is tight
     fabric: FabricConfig = field(default_factory=FabricConfig)
 
@@ -67,89 +67,59 @@ class OutfitConfig:
     garments: list[GarmentConfig] = field(default_factory=list)
 
 
+# The cut of each garment, as `GarmentConfig` names it
+COLUMNS = ("bottom", "top", "sleeve", "ease", "sleeve_ease", "drop", "flare", "edge")
+CUTS = {
+    "trousers": (0.1, 2.75, None, 0.011, 0.012, None, 0.0, 0.0225),
+    "slacks": (0.1, 2.75, None, 0.011, 0.012, None, 0.1, 0.02),
+    "tee": (2.1, None, 0.6, 0.014, 0.016, None, 0.0, 0.016),
+    "shirt": (1.6, None, 1.85, 0.022, 0.022, 3.6, 0.06, 0.0205),
+    "skirt": (0.85, 2.8, None, 0.01, 0.012, 2.6, 0.22, 0.02),
+    "dress": (0.35, None, 0.55, 0.012, 0.015, 2.7, 0.2, 0.0225),
+    "jacket": (2.0, None, 1.85, 0.03, 0.026, 3.8, 0.03, 0.02),
+    "coat": (0.75, None, 1.9, 0.025, 0.024, 3.6, 0.09, 0.023),
+    "hoodie": (1.95, None, 1.9, 0.026, 0.026, None, 0.0, 0.02),
+}
+
+
+def garment(name: str, **changes) -> GarmentConfig:
+    """A garment of `CUTS`, with settings of `GarmentConfig` beside or instead of its columns."""
+    return GarmentConfig(name, **dict(zip(COLUMNS, CUTS[name])) | changes)
+
+
 def trousers(**changes) -> GarmentConfig:
     """Tight ankle-length trousers held by an elastic waistband."""
     denim = FabricConfig(density=0.25, stretch=100.0, shear=40.0, bend=5e-5, thickness=0.006)
-    settings = {"bottom": 0.1, "top": 2.75, "ease": 0.011, "edge": 0.0225, "waistband": 0.03, "cling": 0.02}
-    return GarmentConfig(**{"name": "trousers", "fabric": denim} | settings | changes)
+    return garment("trousers", waistband=0.03, fabric=denim, **changes)
 
 
-def tee(**changes) -> GarmentConfig:
-    """A close-fitting short-sleeved top."""
-    settings = {"bottom": 2.1, "sleeve": 0.6, "ease": 0.014, "sleeve_ease": 0.016, "edge": 0.016}
-    return GarmentConfig("tee", **settings | changes)
+def undershirt(edge: float) -> GarmentConfig:
+    """A tight tee to wear under an open front."""
+    return garment("tee", bottom=2.4, sleeve=0.4, ease=0.01, sleeve_ease=0.01, edge=edge, bulk=0.022)
 
 
 GARMENTS = {
-    "tee": lambda: [trousers(), tee()],
-    "shirt": lambda: [
-        trousers(),
-        GarmentConfig(
-            "shirt", bottom=1.6, sleeve=1.85, ease=0.022, sleeve_ease=0.022, drop=3.6, flare=0.06, edge=0.0205
-        ),
-    ],
-    "skirt": lambda: [
-        GarmentConfig(
-            "skirt", bottom=0.85, top=2.8, ease=0.01, drop=2.6, flare=0.22, edge=0.02, waistband=0.03, cling=0.02
-        ),
-        tee(bottom=2.4),
-    ],
-    "dress": lambda: [
-        GarmentConfig(
-            "dress", bottom=0.35, sleeve=0.55, ease=0.012, sleeve_ease=0.015, drop=2.7, flare=0.2, edge=0.0225
-        )
-    ],
+    "tee": lambda: [trousers(), garment("tee")],
+    "shirt": lambda: [trousers(), garment("shirt")],
+    "skirt": lambda: [garment("skirt", waistband=0.03), garment("tee", bottom=2.4)],
+    "dress": lambda: [garment("dress")],
     "jacket": lambda: [
         trousers(edge=0.024),
-        tee(bottom=2.4, sleeve=0.4, room=0.022, ease=0.01, sleeve_ease=0.01, edge=0.022),
-        GarmentConfig(
-            "jacket",
-            bottom=2.0,
-            sleeve=1.85,
-            ease=0.03,
-            sleeve_ease=0.026,
-            drop=3.8,
-            flare=0.03,
-            opening=0.07,
-            neck=0.01,
-            edge=0.02,
-            cling=0.01,
-            fabric=FabricConfig(density=0.3, bend=4e-5),
-        ),
+        undershirt(0.022),
+        garment("jacket", opening=0.07, neck=0.01, cling=0.01, fabric=FabricConfig(density=0.3, bend=4e-5)),
     ],
     "coat": lambda: [
         trousers(edge=0.024),
-        tee(bottom=2.4, sleeve=0.4, room=0.022, ease=0.01, sleeve_ease=0.01, edge=0.024),
-        GarmentConfig(
-            "coat",
-            bottom=0.75,
-            sleeve=1.9,
-            ease=0.025,
-            sleeve_ease=0.024,
-            drop=3.6,
-            flare=0.09,
-            opening=0.05,
-            edge=0.023,
-            cling=0.04,
-            fabric=FabricConfig(density=0.3, bend=6e-5, friction=0.3),
-        ),
+        undershirt(0.024),
+        garment("coat", opening=0.05, cling=0.04, fabric=FabricConfig(density=0.3, bend=6e-5, friction=0.3)),
     ],
     "slacks": lambda: [
-        trousers(name="slacks", flare=0.1, fabric=FabricConfig(density=0.2, bend=2e-5), edge=0.02),
-        tee(bottom=2.4, edge=0.018),
+        garment("slacks", waistband=0.03, fabric=FabricConfig(density=0.2, bend=2e-5)),
+        garment("tee", bottom=2.4, edge=0.018),
     ],
     "hoodie": lambda: [
         trousers(edge=0.024),
-        GarmentConfig(
-            "hoodie",
-            bottom=1.95,
-            sleeve=1.9,
-            ease=0.026,
-            sleeve_ease=0.026,
-            hood=True,
-            edge=0.02,
-            fabric=FabricConfig(density=0.3, bend=4e-5),
-        ),
+        garment("hoodie", hood=True, fabric=FabricConfig(density=0.3, bend=4e-5)),
     ],
 }
 OUTFIT_NAMES = tuple(GARMENTS)
@@ -159,10 +129,8 @@ DEFAULT_SHAPES = {name: "male" if name in ("tee", "shirt", "coat") else "female"
 def outfit(name: str, shape: str | None = None, edge: float | None = None) -> OutfitConfig:
     """A named outfit on a body shape, its usual one if None; ``edge`` the target edge length of all garments, metres.
 
-    Cling is a force a vertex: with more vertices to an area each of them is pulled less.
-
-    Raises:
-        AvatarError: for an unknown name, listing those there are.
+    Cling is a force a vertex: with more vertices to an area each of them is pulled less. Raises `AvatarError` for an
+    unknown name, listing those there are.
     """
     if name not in GARMENTS:
         raise unknown_name("outfit", name, GARMENTS)

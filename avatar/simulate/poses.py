@@ -11,12 +11,19 @@ from scipy.spatial.distance import cdist
 
 from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.body.open import open_body, open_body_shapes
-from avatar.checks import AvatarError
+from avatar.checks import AvatarError, unknown_name
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.trees import build_tree
-from avatar.simulate.angles import LIMITS, Angles, pose_from_angles
-from avatar.simulate.everyday import EVERYDAY, everyday_angles
-from avatar.simulate.sequences import SEQUENCES, authored_motion
+from avatar.simulate.angles import (
+    EVERYDAY,
+    LIMITS,
+    SEQUENCES,
+    SIDES,
+    Angles,
+    authored_motion,
+    everyday_angles,
+    pose_from_angles,
+)
 
 CLEARANCE = 0.03  # metres kept between forearms, hands, legs and the rest, so that cloth finds room
 APART = 0.5  # radians, norm over all joints' axis-angles: no training pose is nearer to a frame of a test motion
@@ -46,14 +53,14 @@ def random_angles(count: int, seed: int | list[int]) -> Angles:
     signed = (2 * factor - 1 for factor in unit)
     angles = {"yaw": 15 * next(signed)}
     for name in ("trunk_bend", "trunk_twist", "trunk_lean", "head_nod", "head_turn", "head_tilt"):
-        low, high = LIMITS[name]
+        low, _, high = LIMITS[name]
         draw = next(signed)
         angles[name] = np.where(draw > 0, high, -low) * draw * np.abs(draw) ** 0.5
     squat, stride, lift = next(unit) ** 2.5, next(signed), next(signed)
     stance, raised, apart = 14 * next(unit) ** 2, next(unit) ** 1.5, next(signed)
     folded = np.clip(75 * squat + 60 * np.abs(lift) ** 1.5 * (1 - squat), 0, 75) / 75
     angles["trunk_bend"] = np.where(angles["trunk_bend"] > 0, 1 - 0.6 * folded, 1) * angles["trunk_bend"]
-    for side, mirror in (("left", 1.0), ("right", -1.0)):
+    for side, mirror in SIDES:
         lifted = np.clip(mirror * lift, 0, None) ** 1.5 * (1 - squat)
         flexion = 75 * squat + 25 * mirror * stride * (1 - squat) + 60 * lifted
         knee = 90 * squat + 8 + 65 * next(unit) ** 2 * (1 - squat)
@@ -82,15 +89,11 @@ def draw_poses(count: int, seed: int, kind: str) -> list[NamedPose]:
     another sequence (``random.<number>``). ``test``: frames of the authored sequences, spread over each of them
     (``walk.<frame>``).
 
-    Args:
-        count: how many, at least 1; seed: the same seed gives the same poses, whatever was drawn before.
-        kind: train, test or interpolation.
-
-    Raises:
-        AvatarError: for an unknown kind or a count that cannot be met.
+    The same seed gives the same poses, whatever was drawn before. Raises `AvatarError` for an unknown kind or a count
+    that cannot be met.
     """
     if kind not in KINDS:
-        raise AvatarError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}.")
+        raise unknown_name("kind", kind, KINDS)
     if count < 1:
         raise AvatarError(f"count: expected at least 1 pose, got {count}.")
     if kind == "test":
@@ -98,14 +101,12 @@ def draw_poses(count: int, seed: int, kind: str) -> list[NamedPose]:
     if kind == "interpolation":
         drawn = accepted_poses(lambda n: random_angles(n, [seed, 1000]), count)
         return [NamedPose(f"random.{i:05d}", pose) for i, pose in enumerate(drawn)]
-    everyday = [
-        everyday_poses(name, len(range(2 * place, count, 2 * len(EVERYDAY))), seed)
-        for place, name in enumerate(EVERYDAY)
-    ]
-    drawn = accepted_poses(lambda n: random_angles(n, seed), count // 2)
-    even = (everyday[i % len(EVERYDAY)][i // len(EVERYDAY)] for i in range((count + 1) // 2))
-    odd = iter(drawn)
-    return [NamedPose(f"pose.{i:05d}", next(odd if i % 2 else even)) for i in range(count)]
+    poses = [np.empty(0)] * count
+    for place, name in enumerate(EVERYDAY):
+        turns = slice(2 * place, None, 2 * len(EVERYDAY))
+        poses[turns] = everyday_poses(name, len(poses[turns]), seed)
+    poses[1::2] = accepted_poses(lambda n: random_angles(n, seed), count // 2)
+    return [NamedPose(f"pose.{i:05d}", pose) for i, pose in enumerate(poses)]
 
 
 def everyday_poses(name: str, count: int, seed: int) -> list[np.ndarray]:
@@ -137,13 +138,11 @@ def split_distances(poses: dict[str, list[NamedPose]], shape: str = "female") ->
     A distance is the mean over an open body's vertices, its root turned alike; legs are straight where all knees are
     bent by less than `STRAIGHT` and all hips by less than `UPRIGHT`.
 
-    Raises:
-        AvatarError: without training poses.
+    Raises `AvatarError` without training poses.
     """
     if "train" not in poses:
-        raise AvatarError(
-            f"train: expected poses to measure from, got those of {', '.join(poses) or 'no split'} alone."
-        )
+        got = ", ".join(poses) or "no split"
+        raise AvatarError(f"train: expected poses to measure from, got those of {got} alone.")
     body, lines = open_body(shape), []
     knees, hips = ([SMPL_JOINTS.index(f"{side}_{name}") for side in ("left", "right")] for name in ("knee", "hip"))
     for split, named in {"train": poses["train"], **poses}.items():
@@ -187,11 +186,15 @@ def clear_of_itself(poses: np.ndarray, clearance: float = CLEARANCE) -> np.ndarr
     for shape in open_body_shapes():
         body = open_body(shape)
         pairs = _touching_parts(body)
-        posed = body(torch.from_numpy(np.ascontiguousarray(poses, np.float32)))
-        normals = vertex_normals(posed.vertices, body.faces)
+        posed = body(torch.from_numpy(np.ascontiguousarray(poses, np.float32))).vertices
+        normals = vertex_normals(posed, body.faces)
         for frame in np.flatnonzero(clear):
-            points, outward = posed.vertices[frame].numpy(), normals[frame].numpy()
-            clear[frame] = not any(_touch(points, outward, *pair, clearance) for pair in pairs)
+            points, outward = posed[frame].numpy(), normals[frame].numpy()
+            for mover, rest in pairs:
+                distance, nearest = build_tree(points[rest]).query(points[mover])
+                across = points[mover] - points[rest[nearest]]
+                behind = (across * outward[rest[nearest]]).sum(axis=1) < 0
+                clear[frame] &= not ((distance < clearance) | (behind & (distance < 0.15))).any()
     return clear
 
 
@@ -201,23 +204,12 @@ def _touching_parts(body: BodyModel) -> list[tuple[np.ndarray, np.ndarray]]:
     sampled = np.arange(len(owner)) % 3 == 0
     knees = body.template.joints[[SMPL_JOINTS.index("left_knee"), SMPL_JOINTS.index("left_hip")], 1].mean()
     below = body.template.vertices[:, 1].numpy() < float(knees)
-    parts = {}
-    for side in ("left", "right"):
-        legs = [f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")]
-        parts[side, "hand"] = np.isin(owner, [f"{side}_elbow", f"{side}_wrist"])
-        parts[side, "arm"] = np.isin(owner, [f"{side}_{joint}" for joint in ("collar", "shoulder")])
-        parts[side, "leg"] = np.isin(owner, legs) & below
-    pairs = []
-    for side in ("left", "right"):
-        rest = ~parts[side, "hand"] & ~parts[side, "arm"]
-        pairs.append((parts[side, "hand"] & sampled, rest & sampled))
-    pairs.append((parts["left", "leg"] & sampled, parts["right", "leg"] & sampled))
-    return [(np.flatnonzero(mover), np.flatnonzero(rest)) for mover, rest in pairs]
-
-
-def _touch(points: np.ndarray, normals: np.ndarray, mover: np.ndarray, rest: np.ndarray, clearance: float) -> bool:
-    """Whether any mover vertex is within the clearance of, or behind, the surface of the rest."""
-    distance, nearest = build_tree(points[rest]).query(points[mover])
-    across = points[mover] - points[rest[nearest]]
-    behind = (across * normals[rest[nearest]]).sum(axis=1) < 0
-    return bool(((distance < clearance) | (behind & (distance < 0.15))).any())
+    pairs, shins = [], []
+    for side, _ in SIDES:
+        hand, arm, leg = (
+            np.isin(owner, [f"{side}_{joint}" for joint in joints])
+            for joints in (("elbow", "wrist"), ("collar", "shoulder"), ("hip", "knee", "ankle", "foot"))
+        )
+        pairs.append((hand & sampled, ~hand & ~arm & sampled))
+        shins.append(leg & below & sampled)
+    return [(np.flatnonzero(mover), np.flatnonzero(rest)) for mover, rest in (*pairs, shins)]

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avatar.checks import AvatarError, check_finite, check_shape, require
+from avatar.checks import check_finite, check_range, check_shape, require
+from avatar.simulate.mesh_queries import run_kernel, vectors, warp_mesh
 from avatar.simulate.outfits import FabricConfig
 
-LONGEST_CARRY = 0.005  # metres a vertex may be carried on by momentum in one step
+LONGEST_WAY = 0.005  # metres a vertex may be moved on by momentum in one step
 REACH = 0.04  # metres within which the collider is looked for; far above what it moves in a step
 
 
@@ -27,178 +28,67 @@ class SolverConfig:
     creep: float = 1e-3  # m a step below which friction is viscous, so that cloth forgets how it came here
 
     def __post_init__(self):
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise AvatarError(f"{name}: expected a positive number, got {value}.")
-
-
-def cpu_array(values: np.ndarray, dtype):
-    """A warp array on the CPU with a copy of the values."""
-    warp = require("warp")
-    kind = np.int32 if dtype is int else np.float32
-    return warp.array(np.ascontiguousarray(values, kind), dtype=dtype, device="cpu")
-
-
-class Collider:
-    """A moving triangle mesh that cloth rests on: the body, with inner garments over what they cover."""
-
-    def __init__(self, points: np.ndarray, faces: np.ndarray):
-        self.warp = require("warp")
-        self.mesh = self.warp.Mesh(
-            points=cpu_array(points, self.warp.vec3),
-            indices=cpu_array(np.asarray(faces).ravel(), int),
-            velocities=self.warp.zeros(len(points), dtype=self.warp.vec3, device="cpu"),
-        )
-
-    def move(self, points: np.ndarray) -> None:
-        """Moves to new ``(V, 3)`` points; the way since the last call is what friction sees."""
-        current = self.mesh.points.numpy()
-        self.mesh.velocities.assign(np.asarray(points, np.float32) - current)
-        self.mesh.points.assign(np.asarray(points, np.float32))
-        self.mesh.refit()
-
-    def reset(self, points: np.ndarray) -> None:
-        """Jumps to points, standing still there."""
-        self.move(points)
-        self.mesh.velocities.zero_()
-
-
-class Contacts:
-    """Contact with the collider and anchor springs, in the place of Style3D's own collision handler.
-
-    newton's handler treats a mesh as one penalty shape; this one adds smooth directions at edges, per-vertex
-    thickness, creeping friction, anchors, and a limit on each step that keeps vertices outside.
-    """
-
-    def __init__(
-        self,
-        collider: Collider,
-        thickness: np.ndarray,
-        friction: np.ndarray,
-        anchor_stiffness: np.ndarray,
-        config: SolverConfig,
-    ):
-        from avatar.simulate import kernels
-
-        self.kernels, self.warp, self.config, self.collider = kernels, require("warp"), config, collider
-        self.count = len(thickness)
-        vec3, mat33 = self.warp.vec3, self.warp.mat33
-        self.thickness, self.friction = cpu_array(thickness, float), cpu_array(friction, float)
-        self.anchor_stiffness = cpu_array(anchor_stiffness, float)
-        self.points, self.normals, self.drifts, self.anchors, self.products = (
-            self.warp.zeros(self.count, dtype=vec3, device="cpu") for _ in range(5)
-        )
-        self.hessians = self.warp.zeros(self.count, dtype=mat33, device="cpu")
-        self.positions = None
-
-    def launch(self, kernel, *arguments) -> None:
-        """Runs a kernel over all particles."""
-        self.warp.launch(kernel, self.count, list(arguments), device="cpu")
-
-    def frame_begin(self, positions, velocities, step) -> None:
-        """Finds the contacts of a step (called by Style3D)."""
-        mesh = self.collider.mesh.id
-        self.launch(self.kernels.find_contacts, mesh, positions, REACH, self.points, self.normals, self.drifts)
-
-    def accumulate_contact_force(self, step, iteration, state, _, __, forces, previous, ___=None) -> None:
-        """Adds forces and per-particle Hessians at the current iterate (called by Style3D)."""
-        self.positions = state.particle_q
-        self.launch(
-            self.kernels.push_apart,
-            self.positions,
-            previous,
-            self.points,
-            self.normals,
-            self.drifts,
-            self.anchors,
-            self.anchor_stiffness,
-            self.thickness,
-            self.friction,
-            self.config.contact_stiffness,
-            self.config.creep,
-            forces,
-            self.hessians,
-        )
-
-    def contact_hessian_diagonal(self):
-        """The per-particle Hessians (called by Style3D)."""
-        return self.hessians
-
-    def hessian_multiply(self, vectors):
-        """Hessian times vectors (called by Style3D)."""
-        self.launch(self.kernels.apply_hessian, self.hessians, vectors, self.products)
-        return self.products
-
-    def linear_iteration_end(self, steps) -> None:
-        """Limits a step to where no particle enters the collider (called by Style3D)."""
-        self.launch(self.kernels.keep_outside, self.positions, self.points, self.normals, self.thickness, steps)
-
-    def frame_end(self, positions, velocities, step) -> None:
-        """Stops the motion: momentum is carried by `ClothSolver.step` alone (called by Style3D)."""
-        velocities.zero_()
+        check_range(self, *vars(self), above=0)
 
 
 class ClothSolver:
-    """One garment over one collider; a step moves the collider and lets the cloth follow."""
+    """One garment over a moving triangle mesh: newton's Style3D with a collision handler of its own, which this is.
+
+    newton's handler treats a mesh as one penalty shape; this one adds smooth directions at edges, the fabric's
+    thickness, creeping friction, springs to anchors, and a limit on each step that keeps vertices outside.
+    """
 
     def __init__(
         self,
         rest: np.ndarray,
         faces: np.ndarray,
         fabric: FabricConfig,
-        collider: Collider,
-        anchor_stiffness: np.ndarray,
+        collider_points: np.ndarray,
+        collider_faces: np.ndarray,
+        stiffness: np.ndarray,
         config: SolverConfig | None = None,
     ):
-        """Builds the solver.
+        """Builds the solver of a cut garment ``rest (V, 3)``, metres, ``faces (F, 3)``, over a triangle mesh.
 
-        Args:
-            rest: ``(V, 3)`` metres, the cut garment: lengths are those at rest, folds have none.
-            faces: ``(F, 3)``.
-            fabric: what it is made of.
-            collider: what it lies on.
-            anchor_stiffness: ``(V,)`` N/m, pull of each vertex to its anchor.
-            config: time stepping.
+        Lengths are those at rest, folds have none; ``stiffness (V,)`` N/m pulls each vertex to its anchor. Raises
+        `AvatarError` for other shapes or numbers that are not finite.
         """
         dims = check_shape("rest", rest, "V 3")
-        check_shape("anchor_stiffness", anchor_stiffness, "V", V=dims["V"])
+        check_shape("stiffness", stiffness, "V", V=dims["V"])
         check_finite("rest", rest)
         newton, warp = require("newton"), require("warp")
-        warp.config.quiet = True
-        self.config = config or SolverConfig()
+        self.fabric, self.count, self.config = fabric, dims["V"], config or SolverConfig()
+        self.mesh, self.iterate = warp_mesh(collider_points, collider_faces, moving=True), None
+        self.stiffness = warp.array(stiffness, dtype=float, device="cpu")
+        self.points, self.normals, self.drifts, self.anchors, self.products = (
+            vectors(np.zeros((self.count, 3))) for _ in range(5)
+        )
+        self.hessians = warp.zeros(self.count, dtype=warp.mat33, device="cpu")
         with warp.ScopedDevice("cpu"), contextlib.redirect_stdout(io.StringIO()):
-            self.model = build_model(newton, rest, faces, fabric)
-            self.solver = newton.solvers.SolverStyle3D(
-                self.model,
-                config=newton.solvers.SolverStyle3D.Config(
-                    iterations=self.config.iterations, linear_iterations=self.config.linear_iterations
-                ),
-            )
-            full = np.full(len(rest), 1.0)
-            self.contacts = Contacts(
-                collider, full * fabric.thickness, full * fabric.friction, anchor_stiffness, self.config
-            )
-            self.solver.collision = self.contacts
-            self.now, self.next = self.model.state(), self.model.state()
+            model = build_model(newton, rest, faces, fabric)
+            style = newton.solvers.SolverStyle3D
+            rounds = style.Config(iterations=self.config.iterations, linear_iterations=self.config.linear_iterations)
+            self.solver = style(model, config=rounds)
+            self.solver.collision = self
+            self.now, self.next = model.state(), model.state()
             self.last = warp.clone(self.now.particle_q)
-        self.collider = collider
 
     def reset(self, positions: np.ndarray, collider_points: np.ndarray) -> None:
-        """Puts the cloth somewhere, at rest, over a standing collider."""
+        """Puts the cloth somewhere, at rest, over a collider that stands still."""
         self.now.particle_q.assign(np.asarray(positions, np.float32))
         self.last.assign(self.now.particle_q)
         self.moved = np.zeros(len(positions))
-        self.collider.reset(collider_points)
+        self.move(collider_points)
+        self.mesh.velocities.zero_()
 
     def step(self, collider_points: np.ndarray, anchors: np.ndarray, share: float = 1.0) -> None:
         """Moves the collider and its anchors and advances the cloth by a share of one step, at most all of it."""
-        kernels, launch = self.contacts.kernels, self.contacts.launch
-        self.collider.move(collider_points)
-        self.contacts.anchors.assign(np.asarray(anchors, np.float32))
+        self.move(collider_points)
+        self.anchors.assign(np.asarray(anchors, np.float32))
         momentum = self.config.momentum * share
-        launch(kernels.extrapolate, self.now.particle_q, self.last, momentum, LONGEST_CARRY)
+        run_kernel("extrapolate", self.count, self.now.particle_q, self.last, momentum, LONGEST_WAY)
         self.solver.step(self.now, self.next, None, None, self.config.step)
-        launch(kernels.hold_back, self.next.particle_q, self.last, share)
+        run_kernel("hold_back", self.count, self.next.particle_q, self.last, share)
         self.now, self.next = self.next, self.now
         self.moved = np.linalg.norm(self.now.particle_q.numpy() - self.last.numpy(), axis=1)
 
@@ -206,6 +96,43 @@ class ClothSolver:
     def positions(self) -> np.ndarray:
         """Cloth vertices ``(V, 3)``, metres (a copy)."""
         return self.now.particle_q.numpy().copy()
+
+    def move(self, points: np.ndarray) -> None:
+        """Moves the collider to new ``(V, 3)`` points; the way since the last call is what friction sees."""
+        points = np.asarray(points, np.float32)
+        self.mesh.velocities.assign(points - self.mesh.points.numpy())
+        self.mesh.points.assign(points)
+        self.mesh.refit()
+
+    def frame_begin(self, positions, velocities, step) -> None:
+        """Finds the contacts of a step (called by Style3D)."""
+        found = self.points, self.normals, self.drifts
+        run_kernel("find_contacts", self.count, self.mesh.id, positions, REACH, *found)
+
+    def accumulate_contact_force(self, step, iteration, state, _, __, forces, previous, ___=None) -> None:
+        """Adds forces and per-particle Hessians at the current iterate (called by Style3D)."""
+        self.iterate = state.particle_q
+        found = self.points, self.normals, self.drifts, self.anchors, self.stiffness
+        numbers = self.fabric.thickness, self.fabric.friction, self.config.contact_stiffness, self.config.creep
+        run_kernel("push_apart", self.count, self.iterate, previous, *found, *numbers, forces, self.hessians)
+
+    def contact_hessian_diagonal(self):
+        """The per-particle Hessians (called by Style3D)."""
+        return self.hessians
+
+    def hessian_multiply(self, values):
+        """Hessian times vectors (called by Style3D)."""
+        run_kernel("apply_hessian", self.count, self.hessians, values, self.products)
+        return self.products
+
+    def linear_iteration_end(self, steps) -> None:
+        """Limits a step to where no particle enters the collider (called by Style3D)."""
+        thickness = self.fabric.thickness
+        run_kernel("keep_outside", self.count, self.iterate, self.points, self.normals, thickness, steps)
+
+    def frame_end(self, positions, velocities, step) -> None:
+        """Stops the motion: momentum is kept by `step` alone (called by Style3D)."""
+        velocities.zero_()
 
 
 def build_model(newton, rest: np.ndarray, faces: np.ndarray, fabric: FabricConfig):

@@ -25,10 +25,7 @@ class Stopped(Exception):
 
 @contextmanager
 def listening(listener: Callable[[int, FrameType | None], Any], numbers: Iterable[int]) -> Iterator[dict[int, Any]]:
-    """Has signals handled by a function for the length of a ``with`` block; gives the earlier handlers.
-
-    Outside the main thread Python has no signals.
-    """
+    """Has signals of the main thread handled by a function within a ``with`` block; gives the earlier handlers."""
     ours = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, listener) for number in numbers} if ours else {}
     try:
@@ -79,10 +76,7 @@ class StopRequest:
         answer_interrupt(number, "Stopping: this step is finished and saved.")
 
     def leave(self, folder: Path) -> None:
-        """Ends the work once its state is saved; who listened to SIGUSR2 before hears it now.
-
-        Raises `Stopped` always, unless the earlier listener leaves on its own.
-        """
+        """Raises `Stopped` once the state is saved, unless who listened to SIGUSR2 before hears it now and leaves."""
         if self.number == signal.SIGUSR2:
             self.earlier[self.number](self.number, None)
         name = signal.Signals(self.number).name if self.number else "another process"

@@ -1,14 +1,15 @@
-"""The trainer of every method: stages, budget, bad steps, log, validation, checkpoints, stop signals and ranks."""
+"""The trainer of every method: stages, budget, bad steps, inputs, validation, checkpoints, signals, ranks."""
 
 from __future__ import annotations
 
 import logging
 import math
-import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from itertools import islice
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor, nn
@@ -17,10 +18,10 @@ from avatar.checks import AvatarError, DataError
 from avatar.io.checkpoints import load_checkpoint, restoring, save_checkpoint
 from avatar.io.locks import lock_folder
 from avatar.methods.base import SEED_STRIDE, Inputs, Position, Task
+from avatar.methods.settings import Clock
 from avatar.nn.layers import synchronize_norms
 from avatar.progress import Progress
-from avatar.records import LossTerms
-from avatar.training.feeding import Feed, to_device
+from avatar.records import LossTerms, map_tensors
 from avatar.training.logs import TrainingLog
 from avatar.training.signals import StopRequest, stop_requests
 from avatar.world import average, broadcast, current_world, gather, gradients_of
@@ -35,6 +36,7 @@ class Budget(Protocol):
 
     steps: int
     minutes: float | None
+    clock: Clock
     clip: float | None
     validate_every: int
     save_every: int
@@ -50,6 +52,9 @@ class Trainer:
         self.task, self.budget, self.folder, self.model = task, budget, folder, task.model
         self.device = next(self.model.parameters()).device
         self.world = current_world()
+        if budget.minutes and budget.clock is Clock.processor and self.device.type != "cpu":
+            hint = "train.clock=wall, with no other job on the machine."
+            raise AvatarError(f"train.clock: processor time leaves out the work of {self.device.type}. Hint: {hint}")
         if self.world.size > 1:
             synchronize_norms(self.model, task.replicated)
         kept = self.model.state_dict().keys()
@@ -59,9 +64,9 @@ class Trainer:
         self.step, self.seconds, self.stage, self.bad_steps = 0, 0.0, 0, 0
 
     def fit(self) -> None:
-        """Trains until the budget is spent; holds the lock of the run's folder while it does.
+        """Trains until the budget is spent, holding the lock of the run's folder.
 
-        Raises `AvatarError` when losses or gradients stay non-finite, or another job holds the folder. Raises `Stopped`
+        Raises `AvatarError` when losses or gradients stay non-finite or another job holds the folder, and `Stopped`
         after SIGTERM or SIGUSR1, with everything saved.
         """
         with lock_folder(self.folder) if self.world.is_main else nullcontext(), stop_requests() as stop:
@@ -71,19 +76,20 @@ class Trainer:
             try:
                 self.run(log, stop)
             finally:
-                if log:
-                    log.close()
+                if log and log.board:
+                    log.board.close()
 
     def run(self, log: TrainingLog | None, stop: StopRequest) -> None:
         """The steps from here to the end of the budget, with what is logged, validated and saved between them."""
-        started, budget = time.monotonic() - self.seconds, self.budget
-        limit = 60 * budget.minutes if budget.minutes else None
-        bar = Progress(self.task.label, budget.steps, "step", self.step, limit, self.seconds, silent=log is None)
+        budget = self.budget
+        clock = budget.clock.seconds
+        started, limit = clock() - self.seconds, 60 * budget.minutes if budget.minutes else None
+        bar = Progress(self.task.label, budget.steps, "step", self.step, limit, self.seconds, log is None, clock)
         with bar, Feed(self.task.inputs_at, budget.steps, self.device) as feed:
             while self.progress() < 1:
                 terms, rate, norm = self.train_step(feed(self.step))
                 self.step += 1
-                stopping = self.sync_clock(time.monotonic() - started, stop)
+                stopping = self.sync_clock(clock() - started, stop)
                 bar.advance()
                 done, score = self.progress() >= 1, None
                 if self.step % budget.log_every == 0 or done:
@@ -102,9 +108,8 @@ class Trainer:
 
     def write(self, log: TrainingLog | None, split: str, values: dict[str, float]) -> None:
         """Writes one row of the log on the main rank."""
-        if log and values:
-            epoch = self.step * self.task.batch // self.task.frames
-            log.write(split, self.step, epoch, self.seconds, values)
+        if log:
+            log.write(split, self.step, self.step * self.task.batch // self.task.frames, self.seconds, values)
 
     def sync_clock(self, seconds: float, stop: StopRequest) -> bool:
         """Averages the elapsed time over all ranks; True if any rank received a stop signal."""
@@ -124,19 +129,19 @@ class Trainer:
 
     def position(self) -> Position:
         """The stage that the next step belongs to, and how far in it that is."""
-        progress, start = self.progress(), 0.0
-        stages = self.task.stages
-        for index, stage in enumerate(stages):
+        progress, start, last = self.progress(), 0.0, len(self.task.stages) - 1
+        for index, stage in enumerate(self.task.stages):
             end = start + stage.share
-            if progress < end or index == len(stages) - 1:
-                return Position(index, min(1.0, round((progress - start) / (end - start), 12)))
+            if progress < end or index == last:
+                break
             start = end
-        raise AssertionError("expected at least one stage")
+        return Position(index, min(1.0, round((progress - start) / (end - start), 12)))
 
     def train_step(self, inputs: Inputs) -> tuple[LossTerms, float, Tensor]:
         """One optimiser step on inputs that are on the device; gives loss terms, learning rate and gradient norm.
 
-        A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were.
+        A step whose loss or gradients are not finite leaves weights, moments and running statistics as they were; too
+        many of them in a row raise `AvatarError`.
         """
         self.model.train()
         position = self.position()
@@ -165,21 +170,17 @@ class Trainer:
             self.bad_steps = 0
         else:
             self.restore_statistics(before)
-            self.count_bad_step(inputs)
+            self.bad_steps += 1
+        if self.bad_steps > MAX_BAD_STEPS:
+            where = f"(step {self.step}, frames {', '.join(self.task.frame_names(inputs))})"
+            hint = "lower the learning rate or check these frames; the last checkpoint is valid."
+            raise AvatarError(f"loss: not finite for {self.bad_steps} steps in a row {where}. Hint: {hint}")
         return terms, stage.rates[0] * factor, norm
 
     def restore_statistics(self, values: list[Tensor]) -> None:
         """Puts back the running statistics from before a step that was not finite."""
         for statistic, value in zip(self.statistics, values):
             statistic.copy_(value)
-
-    def count_bad_step(self, inputs: Inputs) -> None:
-        """Ends training after too many steps in a row that were not finite."""
-        self.bad_steps += 1
-        if self.bad_steps > MAX_BAD_STEPS:
-            where = f"(step {self.step}, frames {', '.join(self.task.frame_names(inputs))})"
-            hint = "lower the learning rate or check these frames; the last checkpoint is valid."
-            raise AvatarError(f"loss: not finite for {self.bad_steps} steps in a row {where}. Hint: {hint}")
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -202,24 +203,14 @@ class Trainer:
         random = {"cpu": torch.get_rng_state()}
         if self.device.type == "cuda":
             random["cuda"] = torch.cuda.get_rng_state(self.device)
-        state = {
-            "format": FORMAT,
-            "model": self.model.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "step": self.step,
-            "stage": self.stage,
-            "seconds": self.seconds,
-            "random": gather(random, self.world),
-            "threads": torch.get_num_threads(),
-        }
+        state = {"format": FORMAT, "model": self.model.state_dict(), "optimiser": self.optimiser.state_dict()}
+        state |= {"step": self.step, "stage": self.stage, "seconds": self.seconds}
+        state |= {"random": gather(random, self.world), "threads": torch.get_num_threads()}
         if self.world.is_main:
             save_checkpoint(self.folder / "checkpoints", state, self.step, score)
 
     def resume(self) -> None:
-        """Goes back to the newest valid checkpoint; seeds the random state when there is none.
-
-        Raises `DataError` for a checkpoint of an earlier version's trainer, or of another run.
-        """
+        """Goes back to the newest valid checkpoint, else seeds the random state; `DataError` for one of another run."""
         world, folder = self.world, self.folder / "checkpoints"
         state = broadcast(load_checkpoint(folder) if world.is_main else None, world)
         torch.manual_seed(self.budget.seed + SEED_STRIDE * world.rank)
@@ -248,3 +239,50 @@ def spent(budget: Budget, steps: int, seconds: float) -> float:
     """Share of a budget that steps and seconds of training have used, by whichever is further."""
     clock = seconds / (60 * budget.minutes) if budget.minutes else 0.0
     return max(steps / budget.steps, clock)
+
+
+class Feed:
+    """The inputs of training steps on a device: while a step trains there, a thread prepares those of the next one.
+
+    Used as a ``with`` block, at whose end nothing goes on in the background. For CUDA they are copied from pinned
+    memory. On the CPU they are prepared on request: a thread with work of its own would have OpenMP threads of its own,
+    and OpenMP then lets all of them sleep at once (docs/performance.md).
+    """
+
+    def __init__(self, make: Callable[[int], Inputs], steps: int, device: torch.device):
+        """Prepares nothing yet; ``make`` gives the inputs of a step, by one call at a time, at most one step ahead."""
+        self.make, self.steps, self.device = make, steps, device
+        self.pinned = device.type == "cuda"
+        options = {"initializer": torch.cuda.set_device, "initargs": (device,)} if self.pinned else {}
+        self.thread = ThreadPoolExecutor(1, "feed", **options) if device.type != "cpu" else None
+        self.ahead: dict[int, Future[Inputs]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.thread:
+            self.thread.shutdown(cancel_futures=True)
+
+    def __call__(self, step: int) -> Inputs:
+        """The inputs of a step, on the device. What `make` raises for a step is raised here, at that step."""
+        if not self.thread:
+            return to_device(self.make(step), self.device)
+        ready = self.ahead.pop(step, None) or self.thread.submit(self._prepare, step)
+        records = ready.result()
+        self.ahead = {step + 1: self.thread.submit(self._prepare, step + 1)} if step + 1 < self.steps else {}
+        return to_device(records, self.device)
+
+    def _prepare(self, step: int) -> Inputs:
+        records = self.make(step)
+        return tuple(map_tensors(record, pin) for record in records) if self.pinned else records
+
+
+def pin(tensor: Tensor) -> Tensor:
+    """A CPU tensor in page-locked memory; others, such as constant samples on the device, as they are."""
+    return tensor.pin_memory() if tensor.device.type == "cpu" else tensor
+
+
+def to_device(records: Inputs, device: torch.device) -> Inputs:
+    """Inputs with their tensors on a device; from pinned memory without waiting for the copy."""
+    return tuple(map_tensors(record, lambda tensor: tensor.to(device, non_blocking=True)) for record in records)

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from avatar.body.anny import MIXAMO_NAMES, Phenotype, anny_body, anny_template
 from avatar.body.model import SMPL_JOINTS
+from avatar.body.open import MIXAMO_NAMES, Phenotype, anny_body, anny_template
 from avatar.checks import AvatarError
 
 FINGER = "LeftHandIndex1"
@@ -39,7 +39,7 @@ class StandIn:
 
 @pytest.fixture
 def anny(monkeypatch):
-    monkeypatch.setattr("avatar.body.anny.require", lambda name: SimpleNamespace(Anny=StandIn))
+    monkeypatch.setattr("avatar.body.open.require", lambda name: SimpleNamespace(Anny=StandIn))
 
 
 def test_template_is_y_up_with_fingers_in_the_hand(anny):

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from avatar.body.anny import flatten_disc, number_corners, patches_without_uv, quad_corners, toeless_atlas
-from avatar.body.open import open_body
+from avatar.body.open import flatten_disc, number_corners, open_body, patches_without_uv, quad_corners, toeless_atlas
 from avatar.checks import AvatarError
 
 QUADS = np.array([[0, 1, 2, 3], [1, 4, 5, 2]])

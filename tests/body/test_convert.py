@@ -21,8 +21,9 @@ from avatar.body.open import open_body
 from avatar.body.packed import packed_body, write_template
 from avatar.body.smpl import convert_body_model, joint_tree, smpl_body
 from avatar.checks import AvatarError, DataError
+from avatar.cli import start
 from avatar.nn.atlas import Atlas
-from avatar.plain_verbs import convert_body
+from avatar.verbs import VERBS
 
 PROTOCOLS = range(6)
 
@@ -260,6 +261,29 @@ def test_pickles_that_mean_to_exhaust_are_refused_in_little_memory(data, tmp_pat
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("compress", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix])
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("indptr", [0, 300_000_000, 0]),  # as many entries as there are none of
+        ("indptr", [0, 5, -1]),
+        ("indptr", [0, 2**40, 2**40]),
+        ("indices", [0, 300_000_000]),
+        ("indices", [0, -300_000_000]),
+    ],
+)
+def test_sparse_matrices_whose_entries_lie_elsewhere_are_refused(compress, key, values, tmp_path):
+    """In a process of its own: scipy would read and write where they lead."""
+    model = vars(random_model("smpl"))
+    matrix = compress(model["J_regressor"])
+    setattr(matrix, key, np.concatenate([values, getattr(matrix, key)[len(values) :]]).astype(np.int64))
+    (tmp_path / "model.pkl").write_bytes(pickle.dumps({**model, "J_regressor": matrix}))
+    code = "import sys; from avatar.body.smpl import convert_body_model; convert_body_model(*sys.argv[1:])"
+    line = [sys.executable, "-c", code, str(tmp_path / "model.pkl"), str(tmp_path / "plain.npz")]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1 and "DataError" in done.stderr and "model.pkl" in done.stderr, done.stderr
+
+
 def test_mutated_pickles_give_one_kind_of_error(tmp_path):
     """Flipped bytes: the file converts, or it is refused by name; nothing else comes out."""
     whole = pickle.dumps({**vars(random_model("smpl")), "J_regressor": scipy.sparse.csc_matrix(np.eye(24, 40))})
@@ -319,13 +343,13 @@ def test_command_line(tmp_path, monkeypatch, capsys):
 
     def run(*paths: Path) -> None:
         monkeypatch.setattr(sys, "argv", ["convert_body", *map(str, paths)])
-        convert_body()
+        start("convert_body", VERBS["convert_body"])
 
     run(tmp_path / "model.npz", tmp_path / "plain.npz")
     assert "smplh body" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
         run(tmp_path / "none.npz", tmp_path / "plain.npz")
-    assert "none.npz" in capsys.readouterr().err
+    assert "none.npz: expected an npz file" in capsys.readouterr().err
 
 
 def unwrapped(model: dict, places: np.ndarray) -> dict:
@@ -385,7 +409,7 @@ def test_any_template_of_ours_takes_an_atlas_from_an_obj_through_the_command(tmp
     command = ["convert_body.py", "template.npz", "with_uv.npz", "--uv", "body.obj"]
     monkeypatch.setattr(sys, "argv", command)
     monkeypatch.chdir(tmp_path)
-    convert_body()
+    start("convert_body", VERBS["convert_body"])
     assert "packed body" in capsys.readouterr().out
     found = packed_body(tmp_path / "with_uv.npz").template
     torch.testing.assert_close(found.uv[found.uv_faces], body.uv[body.uv_faces])

@@ -190,9 +190,9 @@ def test_plain_skinning_where_bind_is_canonical():
         ({"parents": (-1, -1, 0, 0, 0)}, "every parent before its child"),
         ({"parents": (-1, 0, 0, 0)}, "parents: expected 5 entries"),
         ({"joint_names": ("a",)}, "joint_names: expected 5 entries"),
-        ({"faces": torch.tensor([[0, 1, 40]])}, r"faces: expected indices in \[0, 40\), got 0 to 40"),
+        ({"faces": torch.tensor([[0, 1, 40]])}, r"faces: expected vertex indices in \[0, 40\), got 0 to 40"),
         ({"faces": torch.tensor([[0, 1, -1]])}, "got -1 to 1"),
-        ({"faces": torch.zeros(0, 3).long()}, "at least one triangle"),
+        ({"faces": torch.zeros(0, 3).long()}, "faces: expected triangles of whole numbers, got 0"),
     ],
 )
 def test_templates_that_cannot_be_posed_are_refused(change, message):

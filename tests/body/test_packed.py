@@ -134,7 +134,7 @@ def test_joints_missing_from_the_file_are_estimated(tmp_path):
         ({"parents": np.array([-1, 0, 7, 0, 0])}, "every parent before its child"),
         ({"parents": np.array([-1, 0, 7, 0, 0]), "joints": None}, "every parent before its child"),
         ({"bind_vertices": np.zeros((40, 3))}, "expected all of bind_vertices, bind_joints, zero_from_bind or none"),
-        ({"faces": np.array([[0, 1, 99]])}, "faces: expected indices"),
+        ({"faces": np.array([[0, 1, 99]])}, "faces: expected vertex indices"),
         ({"vertices": None}, "vertices"),
         ({"joint_names": np.array(["a", "b"])}, "joint_names"),
         ({"vertices": np.full((40, 3), np.nan)}, "finite"),

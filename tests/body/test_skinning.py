@@ -10,13 +10,11 @@ from avatar.body.skinning import (
     blend_transforms,
     chain_transforms,
     check_parents,
-    pose_points,
     skin_transforms,
     tree_distances,
-    unpose_points,
 )
 from avatar.checks import AvatarError
-from avatar.geometry.transforms import rotation_from_axis_angle, transform_points
+from avatar.geometry.transforms import invert_affine, rotation_from_axis_angle, transform_points
 
 
 def transforms(batch: int = 3) -> torch.Tensor:
@@ -49,21 +47,10 @@ def test_blend_of_one_hot_weights_is_the_joint():
     torch.testing.assert_close(bottom, torch.tensor([0.0, 0, 0, 1]).double().expand_as(bottom))
 
 
-@pytest.mark.parametrize("batched", [False, True])
-def test_unpose_undoes_pose(batched):
-    bind, motion = random_bind(), transforms()
-    weights = bind.weights.expand(3, -1, -1) if batched else bind.weights
-    points = random_pose(3, 40, seed=4) if batched else bind.vertices
-    posed = pose_points(points, weights, motion)
-    assert posed.shape == (3, 40, 3)
-    torch.testing.assert_close(unpose_points(posed, weights, motion), points.expand(3, -1, -1), atol=1e-8, rtol=0)
-
-
-def test_gradients_of_pose_and_unpose():
-    bind = random_bind()
-    arguments = (bind.vertices[:3], bind.weights[:3].clone().requires_grad_(), transforms(1).requires_grad_())
-    assert torch.autograd.gradcheck(pose_points, arguments)
-    assert torch.autograd.gradcheck(unpose_points, (bind.vertices[None, :3], *arguments[1:]))
+def test_gradients_of_blended_transforms_and_their_inverse():
+    weights, motion = random_bind().weights[:3].clone().requires_grad_(), transforms(1).requires_grad_()
+    assert torch.autograd.gradcheck(blend_transforms, (weights, motion))
+    assert torch.autograd.gradcheck(lambda *given: invert_affine(blend_transforms(*given)), (weights, motion))
 
 
 @pytest.mark.parametrize("parents", [(), (0,), (-1, 1), (-1, -1), (-1, 2, 0)])

@@ -6,10 +6,16 @@ import pytest
 import torch
 from limbs import arm_frame, arm_template
 
-from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Cycle
-from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.losses import TERMS, CanonicalLossConfig, NearestWeights, canonicalization_loss
-from avatar.canonical.posed import DrawConfig, draw_batch, prepare_scan
+from avatar.canonical.canonicalizer import (
+    TERMS,
+    Canonicalizer,
+    CanonicalizerConfig,
+    CanonicalLossConfig,
+    Cycle,
+    cycle_loss,
+)
+from avatar.canonical.fields import BodyField, SkinningFieldConfig
+from avatar.canonical.scans import DrawConfig, draw_batch, prepare_scan
 from avatar.checks import AvatarError
 
 TEMPLATE = arm_template()
@@ -17,7 +23,7 @@ SILENT = dict.fromkeys(TERMS, 0.0)
 SMALL = CanonicalizerConfig(SkinningFieldConfig(width=16), SkinningFieldConfig(width=16, orders=8, latent=4))
 
 SCANS = [prepare_scan(arm_frame(bend), TEMPLATE, 500) for bend in (0.2, 1.3)]
-NEAREST = NearestWeights(TEMPLATE)
+NEAREST = BodyField(TEMPLATE, 1)
 
 
 def batch_of(frames=(0, 1)):
@@ -48,7 +54,7 @@ def perfect_cycle(batch) -> Cycle:
 def test_terms_are_the_equations():
     batch = batch_of()
     cycle = perfect_cycle(batch)
-    raw = canonicalization_loss(cycle, batch, NEAREST, CanonicalLossConfig()).raw
+    raw = cycle_loss(cycle, batch, NEAREST, CanonicalLossConfig()).raw
     assert set(raw) == set(TERMS)
     for name in ("body", "smoothness", "cycle_points", "latent"):
         assert float(raw[name]) == 0, name
@@ -59,7 +65,7 @@ def test_terms_are_the_equations():
     ends = weights_at(2, 30, 2, seed=3)
     codes = torch.arange(8.0).reshape(2, 4)
     wrong = Cycle(off, cycle.canonical, off.flip(1), guess, guess.flip(1), codes, batch.points + 0.03, ends)
-    raw = canonicalization_loss(wrong, batch, NEAREST, CanonicalLossConfig(beta=0.5)).raw
+    raw = cycle_loss(wrong, batch, NEAREST, CanonicalLossConfig(beta=0.5)).raw
 
     def squares(a, b):
         return float(((a - b) ** 2).sum(-1).mean())
@@ -85,7 +91,7 @@ def test_every_term_counts_with_its_weight_and_its_gradient_lowers_it(term):
     config = CanonicalLossConfig(**(SILENT | {term: 2.5}))
 
     def loss():
-        return canonicalization_loss(model(batch, model.batch_codes(batch), True), batch, NEAREST, config)
+        return cycle_loss(model(batch, model.batch_codes(batch), True), batch, NEAREST, config)
 
     before = loss()
     assert list(before.weighted) == [term]
@@ -102,8 +108,8 @@ def test_every_term_counts_with_its_weight_and_its_gradient_lowers_it(term):
 def test_weight_zero_ablates_a_term_and_no_other(term):
     batch = batch_of()
     cycle = replace(perfect_cycle(batch), codes=torch.ones(2, 4), reposed=batch.points + 1)
-    whole = canonicalization_loss(cycle, batch, NEAREST, CanonicalLossConfig())
-    less = canonicalization_loss(cycle, batch, NEAREST, CanonicalLossConfig(**{term: 0.0}))
+    whole = cycle_loss(cycle, batch, NEAREST, CanonicalLossConfig())
+    less = cycle_loss(cycle, batch, NEAREST, CanonicalLossConfig(**{term: 0.0}))
     assert set(whole.weighted) - set(less.weighted) == {term}
     assert set(less.raw) == set(TERMS)  # still measured
     torch.testing.assert_close(whole.total - whole.weighted[term], less.total)
@@ -113,11 +119,10 @@ def test_cycle_terms_wait_for_the_second_stage_and_grow_in_its_second_half():
     batch = batch_of()
     cycle = replace(perfect_cycle(batch), reposed=batch.points + 1)
     apart = replace(cycle, reposed=None, edge_weights=None)
-    first = canonicalization_loss(apart, batch, NEAREST, CanonicalLossConfig()).weighted
+    first = cycle_loss(apart, batch, NEAREST, CanonicalLossConfig()).weighted
     assert set(first) == {"body", "nearest", "sparsity", "latent"}
     late, early = (
-        canonicalization_loss(cycle, batch, NEAREST, CanonicalLossConfig(), progress).weighted
-        for progress in (0.5, 0.49)
+        cycle_loss(cycle, batch, NEAREST, CanonicalLossConfig(), progress).weighted for progress in (0.5, 0.49)
     )
     torch.testing.assert_close(late["cycle_points"], 10 * early["cycle_points"])
     torch.testing.assert_close(late["cycle_weights"], early["cycle_weights"])
@@ -134,7 +139,7 @@ def test_sparsity_prefers_one_joint_and_stays_finite_at_zero_weights():
     for weights in (torch.eye(3)[torch.zeros(2, 60).long()], weights_at(2, 60)):
         weights = weights.clone().requires_grad_()
         cycle = replace(perfect_cycle(batch), scan_weights=weights)
-        value = canonicalization_loss(cycle, batch, NEAREST, CanonicalLossConfig()).raw["sparsity"]
+        value = cycle_loss(cycle, batch, NEAREST, CanonicalLossConfig()).raw["sparsity"]
         value.backward()
         assert torch.isfinite(weights.grad).all()
         assert float(value) == pytest.approx(1, abs=1e-3) if weights.max() == 1 else float(value) > 1.1

@@ -7,7 +7,8 @@ import pytest
 import torch
 from limbs import arm_frame, arm_template, true_weights
 
-from avatar.canonical.scans import KNN, NearestBody, canonicalize_scan, cut_stretched, edge_stretch
+from avatar.canonical.fields import KNN, BodyField
+from avatar.canonical.scans import canonicalize_scan, cut_stretched, edge_stretch
 from avatar.checks import AvatarError
 from avatar.records import Scan
 
@@ -111,9 +112,9 @@ def test_wrong_weights_and_scans_of_which_nothing_is_left_are_refused():
 
 def test_nearest_body_takes_the_weights_of_the_vertex_it_lies_on():
     frame = arm_frame(1.0)
-    found = NearestBody(TEMPLATE).weights_of(frame.body.vertices[::7], frame)
+    found = BodyField(TEMPLATE, 1).weights_of(frame.body.vertices[::7], frame)
     np.testing.assert_allclose(found, TEMPLATE.weights.numpy()[::7], atol=1e-6)
-    blended = NearestBody(TEMPLATE, KNN).weights_of(frame.body.vertices[::7], frame)
+    blended = BodyField(TEMPLATE, KNN).weights_of(frame.body.vertices[::7], frame)
     np.testing.assert_allclose(blended, TEMPLATE.weights.numpy()[::7], atol=1e-5)  # distance 0 has all the say
 
 
@@ -125,6 +126,6 @@ def test_knn_weighs_by_inverse_distance():
         order = np.argsort(distances, axis=1)[:, :count]
         closeness = 1 / np.take_along_axis(distances, order, axis=1)
         expected = (closeness[..., None] * TEMPLATE.weights.numpy()[order]).sum(axis=1) / closeness.sum(1)[:, None]
-        np.testing.assert_allclose(NearestBody(TEMPLATE, count).weights_of(points, frame), expected, atol=1e-5)
+        np.testing.assert_allclose(BodyField(TEMPLATE, count).weights_of(points, frame), expected, atol=1e-5)
     with pytest.raises(AvatarError, match="neighbours"):
-        NearestBody(TEMPLATE, 0)
+        BodyField(TEMPLATE, 0)

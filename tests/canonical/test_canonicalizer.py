@@ -10,7 +10,7 @@ from avatar.body.open import open_body
 from avatar.body.skinning import skin_transforms
 from avatar.canonical.canonicalizer import CODE_SPREAD, Canonicalizer, CanonicalizerConfig, Latent
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.posed import DrawConfig, draw_batch, prepare_scan
+from avatar.canonical.scans import DrawConfig, draw_batch, prepare_scan
 from avatar.checks import AvatarError
 from avatar.geometry.transforms import transform_points
 

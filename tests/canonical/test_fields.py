@@ -7,10 +7,10 @@ from avatar.canonical.fields import (
     SkinningField,
     SkinningFieldConfig,
     bounding_box,
-    fourier_features,
     normalise,
 )
 from avatar.checks import AvatarError
+from avatar.geometry.transforms import fourier_features
 
 BOX = torch.tensor([[-1.0, -2, -3], [1, 2, 3]])
 

@@ -9,7 +9,7 @@ from limbs import RADIUS, SLEEVE, arm_frame, arm_template
 
 from avatar.body.skinning import chain_transforms, skin_transforms
 from avatar.canonical.fields import bounding_box
-from avatar.canonical.posed import (
+from avatar.canonical.scans import (
     CONCAVE,
     DrawConfig,
     draw_batch,

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from torch.utils.data import DataLoader
 
 from avatar.checks import AvatarError
-from avatar.data.batches import FrameDataset, bytes_of, collate, draw_points, name_frames
+from avatar.data.batches import FrameDataset, bytes_of, draw_points, name_frames
 
 
 @pytest.fixture
@@ -55,8 +54,6 @@ def test_scan_points_change_from_epoch_to_epoch_and_frame_to_frame(frames):
     first, again, next_epoch = frames.item(0, 1), frames.item(0, 1), frames.item(1, 1)
     assert torch.equal(first.scan_points, again.scan_points)
     assert not torch.equal(first.scan_points, next_epoch.scan_points)
-    frames.epoch = 1
-    assert torch.equal(frames[1].scan_points, next_epoch.scan_points)
     places = [cKDTree(frames.frame(index).scan.points).query(frames.item(0, index).scan_points)[1] for index in (0, 1)]
     assert not np.array_equal(*places)  # another frame, other places in its scan
 
@@ -66,13 +63,7 @@ def test_an_epoch_gives_every_frame_once(frames):
     ordered = [name for batch in frames.ordered_batches(4) for name in batch.names]
     assert ordered == [name.name for name in frames.names]
     one = next(iter(frames.ordered_batches(4))).scan_points
-    frames.epoch = 3  # validation does not depend on it
     assert torch.equal(one, next(iter(frames.ordered_batches(4))).scan_points)
-
-
-def test_a_torch_loader_reads_it_too(frames):
-    loader = DataLoader(frames, batch_size=3, collate_fn=collate)
-    assert [name for batch in loader for name in batch.names] == [name.name for name in frames.names]
 
 
 def test_scans_with_fewer_points_repeat_them_evenly():

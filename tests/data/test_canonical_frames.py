@@ -11,8 +11,8 @@ from tiny import canonical_truth
 
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset, name_frames
-from avatar.data.canonical_frames import CanonicalOutfit
-from avatar.io.canonical_scans import write_canonical_scan
+from avatar.data.layouts import CanonicalOutfit
+from avatar.io.frames import write_canonical_scan
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
 from avatar.body.packed import write_body
 from avatar.checks import DataError
-from avatar.data.consistency import check_joints
 from avatar.data.layouts import find_outfit
 from avatar.data.packed_layout import PackedOutfit
+from avatar.data.validation import check_joints
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,18 @@ import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from avatar.data.fusion import boundary_partners, fuse_mesh, fused_noise, split_faces, split_long_edges, weld_contacts
-from avatar.data.scanner import DressedSurface, Pattern, ScanConfig, scan_mesh
+from avatar.data.scanner import (
+    DressedSurface,
+    Pattern,
+    ScanConfig,
+    boundary_partners,
+    fuse_mesh,
+    fused_noise,
+    scan_mesh,
+    split_faces,
+    split_long_edges,
+    weld_contacts,
+)
 from avatar.records import Scan
 
 

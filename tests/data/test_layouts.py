@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from avatar.body.open import open_body
 from avatar.body.packed import write_body, write_template
 from avatar.checks import AvatarError, DataError
+from avatar.data.folders import outfit_folder
 from avatar.data.layouts import OpenOutfit, find_outfit, open_outfit_folder
-from avatar.data.outfits import outfit_folder
 from avatar.data.packed_layout import PackedOutfit, fit_joint_transforms, write_packed_frame, write_packed_outfit
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import split_outfit
@@ -355,7 +355,7 @@ def test_outfits_are_found_by_name(tiny_folder):
 def test_pop_nesting_and_the_embedded_sample_are_found(tiny_folder, tmp_path, monkeypatch):
     shutil.copytree(tiny_folder, tmp_path / "resynth" / "packed" / "tiny")
     assert outfit_folder(tmp_path, "resynth", "tiny") == tmp_path / "resynth" / "packed" / "tiny"
-    monkeypatch.setattr("avatar.data.outfits.SAMPLE_FOLDER", tiny_folder.parent)
+    monkeypatch.setattr("avatar.data.folders.SAMPLE_FOLDER", tiny_folder.parent)
     assert find_outfit(tmp_path / "nowhere", "sample", "tiny").path == tiny_folder
 
 

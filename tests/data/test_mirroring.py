@@ -5,7 +5,7 @@ import torch
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
-from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map, swap_side
+from avatar.data.batches import mirror_batch, mirror_coins, mirror_map, swap_side
 from avatar.records import Batch
 
 FLIP = torch.tensor([-1.0, 1.0, 1.0])

@@ -16,9 +16,9 @@ from avatar.body.open import open_body
 from avatar.body.packed import write_template
 from avatar.body.registry import canonical_pose
 from avatar.checks import DataError
+from avatar.cli import pack
 from avatar.data.layouts import OpenOutfit, open_outfit_folder
 from avatar.data.packed_layout import PackedOutfit
-from avatar.plain_verbs import pack
 
 POSE = tiny_pose(0.5)
 

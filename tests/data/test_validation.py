@@ -261,7 +261,9 @@ def test_the_turns_that_are_named_for_a_template_mend_it(tmp_path):
 
 
 def test_a_template_without_known_joints_is_judged_by_its_shape(tmp_path):
-    plain = dataclasses.replace(turned_template(np.eye(3)), joint_names=("root",), joints=torch.zeros(1, 3))
+    plain = turned_template(np.eye(3))
+    one = {"joint_names": ("root",), "joints": torch.zeros(1, 3), "parents": plain.parents[:1]}
+    plain = dataclasses.replace(plain, weights=torch.ones(len(plain.vertices), 1), **one)
     check_template(plain, tmp_path)
     lying = dataclasses.replace(plain, vertices=turned_template(turn_about("x", 90)).vertices)
     with pytest.raises(DataError, match=r"stands along y.*-90 degrees about x"):

@@ -47,9 +47,9 @@ def ball():
 
 @pytest.fixture
 def ball_without_truth():
-    """The same outfit from a dataset that has neither true surface nor template."""
+    """The same outfit from a dataset that does not have the true surface."""
     outfit = SphereOutfit()
-    outfit.resample, outfit.template = None, None
+    outfit.resample = None
     outfit.load = lambda split, name: SphereOutfit().load(split, name)
     return outfit
 

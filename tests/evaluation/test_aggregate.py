@@ -6,11 +6,13 @@ import pytest
 from avatar.checks import AvatarError
 from avatar.evaluation.aggregate import (
     Cell,
+    Place,
+    average_seeds,
     bootstrap_mean,
     frame_weighted_mean,
     order_methods,
     paired_differences,
-    tabulate,
+    rows_of,
     worst_outfit,
 )
 from avatar.evaluation.scores import FrameScore, Score
@@ -38,15 +40,16 @@ def test_mean_counts_frames_and_max_counts_outfits():
 def test_seeds_are_averaged_and_variants_kept_apart():
     rows = [score("dress", "closet", 1.0, seed=0), score("dress", "closet", 3.0, seed=1)]
     rows.append(score("dress", "closet", 9.0, variant="learned"))
-    grid = tabulate(rows, "cd_point")
-    assert {method: cell.value for method, cell in grid["dress"].items()} == {"closet": 2.0, "closet (learned)": 9.0}
+    found = {place: cell.value for place, cell in average_seeds(rows).items()}
+    expected = {"closet": 2.0, "closet (learned)": 9.0}
+    assert found == {Place(method, "dress", "cd_point"): value for method, value in expected.items()}
 
 
 def test_two_rows_for_one_number_are_refused():
     with pytest.raises(AvatarError, match="two scores of cd_point for closet on dress"):
-        tabulate([score("dress", "closet", 1.0)] * 2, "cd_point")
+        average_seeds([score("dress", "closet", 1.0)] * 2)
     with pytest.raises(AvatarError, match="no score of cd_pop"):
-        tabulate([score("dress", "closet", 1.0)], "cd_pop")
+        rows_of([score("dress", "closet", 1.0)], ["cd_pop"])
 
 
 def test_floors_come_first():

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import trimesh
 
-from avatar.evaluation.crossings import crossing_faces
+from avatar.evaluation.shapes import crossing_faces
 
 
 def both(first, second):

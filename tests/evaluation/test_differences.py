@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 
 from avatar.checks import AvatarError
-from avatar.evaluation.differences import ALL, budget_table, compare_methods, difference_table, differences_csv
+from avatar.evaluation.aggregate import ALL, compare_methods, differences_csv
 from avatar.evaluation.scores import FrameScore, Score, Scores
+from avatar.evaluation.tables import budget_table, difference_table
 
 
 def frames(method, outfit, values, variant=""):

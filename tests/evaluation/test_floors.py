@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from avatar.checks import AvatarError
-from avatar.evaluation.floors import sample_body, score_body_floor, score_sampling_floor
-from avatar.evaluation.scoring import ScoreConfig
+from avatar.evaluation.scoring import ScoreConfig, measure_floors, sample_body
 from avatar.records import Mesh
 
 CONFIG = ScoreConfig(metrics=["cd_point", "cd_pop", "s2m_cm", "jitter", "penetration_share"], motion=True)
@@ -22,14 +21,14 @@ def test_sampling_floor_shrinks_with_the_count(ball):
     few, many = [], []
     for points, found in ((1500, few), (6000, many)):
         ball.points = points
-        found.append(values(score_sampling_floor(ball, "test", CONFIG, points))["cd_point"])
+        found.append(values(measure_floors(ball, "test", CONFIG, points).only("method", ["sampling"]))["cd_point"])
     assert few[0] / many[0] == pytest.approx(4, rel=0.1)
 
 
 def test_sampling_floor_is_the_spacing_of_random_points(ball):
     """Mean squared distance to the nearest of N independent points on area A is A / (pi N)."""
     ball.points = 5000
-    scores = score_sampling_floor(ball, "test", CONFIG, 5000, commit="abc")
+    scores = measure_floors(ball, "test", CONFIG, 5000, commit="abc").only("method", ["sampling"])
     assert values(scores)["cd_point"] == pytest.approx(2 * 4 / 5000, rel=0.05)
     row = scores.rows[0]
     assert (row.method, row.variant, row.points, row.commit) == ("sampling", "", 5000, "abc")
@@ -39,7 +38,7 @@ def test_sampling_floor_is_the_spacing_of_random_points(ball):
 
 def test_sampling_floor_from_halves_is_marked(ball_without_truth, caplog):
     with caplog.at_level(logging.WARNING):
-        scores = score_sampling_floor(ball_without_truth, "test", CONFIG, 3000)
+        scores = measure_floors(ball_without_truth, "test", CONFIG, 3000).only("method", ["sampling"])
     assert {row.variant for row in scores.rows} == {"halves"}
     assert {row.points for row in scores.rows} == {1500}
     assert values(scores)["cd_point"] == pytest.approx(2 * 4 / 1500, rel=0.1)
@@ -50,20 +49,15 @@ def test_a_sampling_that_is_not_independent_is_refused(ball):
     again = ball.resample
     ball.resample = lambda split, name, points, seed: again(split, name, points, 0)
     with pytest.raises(AvatarError, match="another sampling"):
-        score_sampling_floor(ball, "test", CONFIG, 3000)
+        measure_floors(ball, "test", CONFIG, 3000).only("method", ["sampling"])
 
 
 def test_body_floor_is_the_gap_between_body_and_cloth(ball):
-    scores = score_body_floor(ball, "test", CONFIG, 20_000)
+    scores = measure_floors(ball, "test", CONFIG, 20_000).only("method", ["body"])
     assert values(scores)["s2m_cm"] == pytest.approx(10, abs=0.1)
     assert values(scores)["cd_pop"] == pytest.approx(2 * 0.1**2, rel=0.1)
     assert {(row.method, row.points) for row in scores.rows} == {("body", 20_000)}
     assert "jitter" not in values(scores)
-
-
-def test_body_floor_without_a_template_says_so(ball_without_truth):
-    with pytest.raises(AvatarError, match="no template"):
-        score_body_floor(ball_without_truth, "test", CONFIG, 100)
 
 
 def test_body_points_lie_on_the_body_with_its_normals(ball):

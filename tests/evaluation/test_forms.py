@@ -3,8 +3,8 @@
 import pytest
 
 from avatar.checks import AvatarError
-from avatar.evaluation.forms import Axis, FormConfig, ReportedTable, form_table, reported_table
 from avatar.evaluation.scores import Score
+from avatar.evaluation.tables import Axis, FormConfig, ReportedTable, form_table, reported_table
 
 CD = {("dress", "sampling"): 1e-4, ("dress", "pop"): 9e-4, ("tee", "sampling"): 2e-4, ("tee", "pop"): 4e-4}
 FRAMES = {"dress": 30, "tee": 10}

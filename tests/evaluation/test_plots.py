@@ -4,10 +4,9 @@ import re
 from xml.etree import ElementTree
 
 import pytest
-from matplotlib.figure import Figure
 
 from avatar.checks import DataError
-from avatar.evaluation.plots import inline_svg, plot_losses, plot_outfits, save_figure
+from avatar.evaluation.plots import inline_svg, plot_losses, plot_outfits
 from avatar.evaluation.scores import Score
 
 LOG = "split,step,epoch,seconds,total,chamfer\ntrain,1,0,0.1,4,3\nvalidation,1,0,0.2,,5\ntrain,2,0,0.3,0.1,2\n"
@@ -66,9 +65,3 @@ def test_svg_is_inline_ready(log):
     used = set(re.findall(r'url\(#([^)]*)\)|href="#([^"]*)"', svg))
     assert used and all((clip or link) in ids for clip, link in used)
     assert svg == inline_svg(plot_losses(log), "one", 'Loss "terms" & <more>')
-
-
-def test_figures_are_saved_by_suffix(tmp_path, log):
-    save_figure(plot_losses(log), tmp_path / "plots" / "loss.png")
-    assert (tmp_path / "plots" / "loss.png").read_bytes().startswith(b"\x89PNG")
-    assert isinstance(plot_losses(log), Figure)

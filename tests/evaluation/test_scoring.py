@@ -1,13 +1,16 @@
 """Scoring of folders: values, means, errors that name frames, and what is drawn from scans."""
 
 import logging
+import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from avatar.checks import AvatarError, DataError
-from avatar.evaluation.scoring import Label, ScoreConfig, draw_scan, score_predictions
+from avatar.evaluation.metrics import find_metrics
+from avatar.evaluation.scoring import Contender, Label, Memory, ScoreConfig, draw_scan, score_frames, score_predictions
 from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
 from avatar.records import Mesh, PointCloud
@@ -53,8 +56,6 @@ def test_missing_frames_are_named(ball, predictions):
         score_predictions(predictions, ball, "test", ScoreConfig(metrics=FAST), Label("closet"))
     with pytest.raises(DataError, match="no such folder"):
         score_predictions(predictions / "none", ball, "test", ScoreConfig(metrics=FAST), Label("closet"))
-    with pytest.raises(AvatarError, match="no frames in 'tset'"):
-        score_predictions(predictions, ball, "tset", ScoreConfig(metrics=FAST), Label("closet"))
 
 
 def test_extra_files_are_ignored_with_a_warning(ball, predictions, caplog):
@@ -88,6 +89,21 @@ def test_error_in_a_metric_names_the_frame(ball, predictions, sphere_cloud):
         score_predictions(predictions, ball, "test", ScoreConfig(metrics=["uniformity"]), Label("closet"))
 
 
+def test_a_value_that_is_not_finite_is_seen_in_the_mean_and_left_out_where_values_are_partial(ball):
+    metric = replace(find_metrics(["cd_point"])[0], measure=lambda seen: seen.value)
+    memory = Memory(None, "closet", ball, "test")
+
+    def compare(frame):
+        return SimpleNamespace(value=math.inf if frame.name == "walk.0001" else 1.0, points=frame.scan.points)
+
+    def score(partial):
+        contenders = [Contender(Label("closet"), compare, memory)]
+        (row,) = score_frames(ball, "test", ball.names, [metric], contenders, partial=partial).rows
+        return row.value, row.frames
+
+    assert score(partial=False) == (math.inf, 4) and score(partial=True) == (1.0, 3)
+
+
 def test_unknown_metric_and_bad_counts_are_refused_at_once():
     with pytest.raises(AvatarError, match=r"chamfer.*cd_point"):
         ScoreConfig(metrics=["chamfer"])
@@ -106,14 +122,6 @@ def test_meshes_take_the_place_of_points_in_surface_metrics(ball, predictions, t
     plain = score_predictions(predictions, ball, "test", config, Label("closet"))
     assert value(scores, "cd_point") == value(plain, "cd_point")
     assert "self_intersection" not in {row.metric for row in plain.rows}  # points have no faces
-
-
-def test_penetration_needs_a_template_and_is_left_out_with_a_warning(ball_without_truth, predictions, caplog):
-    config = ScoreConfig(metrics=["cd_point", "penetration_share"])
-    with caplog.at_level(logging.WARNING):
-        scores = score_predictions(predictions, ball_without_truth, "test", config, Label("closet"))
-    assert [row.metric for row in scores.rows] == ["cd_point"]
-    assert "penetration" in caplog.text
 
 
 def test_penetration_through_the_folder(ball, predictions, sphere_cloud):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avatar.evaluation.metrics import METRICS, Comparison
-from avatar.evaluation.views import PIXELS, render_normals, view_axes, view_frame
+from avatar.evaluation.shapes import PIXELS, render_normals, view_axes, view_frame
 from avatar.records import PointCloud, Scan
 
 

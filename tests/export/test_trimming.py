@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from avatar.export.trimming import cut_surface, drop_small_parts, trim_surface
+from avatar.export.meshing import cut_surface, drop_small_parts, trim_surface
 from avatar.records import Mesh, PointCloud
 
 

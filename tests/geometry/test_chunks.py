@@ -92,5 +92,5 @@ def test_a_surface_in_little_memory_is_the_same_to_the_bit():
 
     box, config = torch.tensor([[-1.0] * 3, [1.0] * 3]), ExtractionConfig(48, lipschitz=3.0)
     whole, parts = extract_surface(field, box, config), extract_surface(limited, box, config)
-    np.testing.assert_array_equal(parts.mesh.vertices, whole.mesh.vertices)
-    np.testing.assert_array_equal(parts.mesh.faces, whole.mesh.faces)
+    np.testing.assert_array_equal(parts.vertices, whole.vertices)
+    np.testing.assert_array_equal(parts.faces, whole.faces)

@@ -7,8 +7,7 @@ import torch
 from reference import chamfer_loop
 
 from avatar.checks import AvatarError
-from avatar.geometry.distances import normal_difference, point_to_plane, point_to_point
-from avatar.geometry.neighbours import correspond
+from avatar.geometry.neighbours import correspond, normal_difference, point_to_plane, point_to_point
 from avatar.geometry.sparse import gather_rows
 from avatar.geometry.transforms import rotation_from_axis_angle
 

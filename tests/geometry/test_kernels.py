@@ -4,11 +4,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 
-from avatar.geometry.neighbours import fused_search, k_nearest, nearest, try_fused
+from avatar.geometry.neighbours import k_nearest, nearest, try_fused
 
 ROOT = Path(__file__).parents[2]
 
@@ -73,7 +74,9 @@ def test_a_search_that_fails_once_is_tried_again(monkeypatch, caplog):
             raise failure
         return torch.full(queries.shape[:2], 3)
 
-    monkeypatch.setattr("avatar.geometry.neighbours.fused_search", lambda: search)
+    kernels = ModuleType("avatar.geometry.kernels")
+    kernels.nearest_fused = search
+    monkeypatch.setitem(sys.modules, kernels.__name__, kernels)
     monkeypatch.setattr("avatar.geometry.neighbours.WARNED", set())
     assert [try_fused(queries, points) for _ in range(3)] == [None] * 3
     assert torch.equal(try_fused(queries, points), torch.full((1, 5), 3))
@@ -85,11 +88,11 @@ def test_without_triton_nothing_is_tried_and_a_warning_says_so(monkeypatch, capl
     monkeypatch.setitem(sys.modules, "triton", None)
     monkeypatch.delitem(sys.modules, "avatar.geometry.kernels", raising=False)
     monkeypatch.setattr("avatar.geometry.neighbours.WARNED", set())
-    fused_search.cache_clear()
-    try:
-        assert fused_search() is None and try_fused(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3)) is None
-    finally:
-        fused_search.cache_clear()
+    assert try_fused(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3)) is None
+    kernels = ModuleType("avatar.geometry.kernels")
+    kernels.nearest_fused = lambda queries, points: pytest.fail("looked for again")
+    monkeypatch.setitem(sys.modules, kernels.__name__, kernels)
+    assert try_fused(torch.zeros(1, 1, 3), torch.zeros(1, 1, 3)) is None
     assert len(caplog.records) == 1 and "slow way" in caplog.text and "triton" in caplog.text
 
 
@@ -97,7 +100,7 @@ def test_without_triton_nothing_is_tried_and_a_warning_says_so(monkeypatch, capl
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_search_on_cuda_agrees_with_the_trees():
     q, p = torch.randn(2, 5000, 3), torch.randn(2, 4000, 3)
-    assert fused_search() is not None
+    assert try_fused(q.cuda(), p.cuda()) is not None
     ids = nearest(q.cuda(), p.cuda()).cpu()
     apart = [(q - p.gather(1, i[..., None].expand(-1, -1, 3))).norm(dim=-1) for i in (ids, k_nearest(q, p, 1)[..., 0])]
     torch.testing.assert_close(*apart)

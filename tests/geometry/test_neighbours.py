@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import ball_loop, nearest_loop
+from reference import ball_loop, nearest_loop, ranked_ball_loop
 
 from avatar.checks import AvatarError
 from avatar.geometry import neighbours
@@ -20,6 +20,7 @@ from avatar.geometry.neighbours import (
     k_nearest,
     nearest,
 )
+from avatar.geometry.surface import farthest_points
 from avatar.geometry.trees import build_tree
 
 
@@ -106,13 +107,13 @@ def test_chunked_search_carries_nan_through_with_indices_in_range():
 
 
 def test_counts_and_shapes_are_checked():
-    with pytest.raises(AvatarError, match="k=6 points or more, got 5"):
+    with pytest.raises(AvatarError, match="k of 1 to the 5 points, got 6"):
         k_nearest(cloud(1, 5, 0), cloud(1, 5, 1), 6)
-    with pytest.raises(AvatarError, match="at least 1"):
+    with pytest.raises(AvatarError, match="k of 1 to the 5 points, got 0"):
         k_nearest(cloud(1, 5, 0), cloud(1, 5, 1), 0)
     with pytest.raises(AvatarError, match="B=1"):
         nearest(cloud(1, 5, 0), cloud(2, 5, 1))
-    with pytest.raises(AvatarError, match="k=1"):
+    with pytest.raises(AvatarError, match="k of 1 to the 0 points, got 1"):
         nearest(cloud(1, 5, 0), torch.zeros(1, 0, 3))
 
 
@@ -121,6 +122,25 @@ def test_ball_query_agrees_with_loop(radius):
     centres, points = cloud(1, 12, 0)[0], cloud(1, 60, 1)[0]
     found = ball_query(centres, points, radius, 8)
     assert found.tolist() == ball_loop(centres.double().numpy(), points.double().numpy(), radius, 8)
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.3, 1.0, 5.0])
+def test_ranked_ball_query_agrees_with_loop(radius):
+    centres, points = cloud(1, 12, 0)[0], cloud(1, 60, 1)[0]
+    ranks = torch.randperm(60, generator=torch.Generator().manual_seed(2))
+    found = ball_query(centres, points, radius, 8, ranks)
+    slow = ranked_ball_loop(centres.double().numpy(), points.double().numpy(), radius, 8, ranks.tolist())
+    assert found.tolist() == slow
+
+
+def test_ranked_groups_reach_as_far_as_their_balls_not_as_far_as_their_number():
+    """12 of 6,000 points on a square metre: the nearest lie within 3 cm, a ball of 15 cm holds hundreds."""
+    points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
+    centres = torch.tensor([[0.5, 0.5, 0.0], [0.3, 0.6, 0.0]])
+    ranks = farthest_points(points, len(points)).argsort()
+    for order, least, most in ((ranks, 0.1, 0.15), (None, 0.0, 0.03)):
+        reach = (points[ball_query(centres, points, 0.15, 12, order)] - centres[:, None]).norm(dim=-1).amax(dim=1)
+        assert (least < reach).all() and (reach <= most).all()
 
 
 def test_ball_query_groups_longer_than_the_cloud_repeat_the_nearest():

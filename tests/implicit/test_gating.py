@@ -9,7 +9,7 @@ from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.geometry.transforms import assemble_transform
-from avatar.implicit.fields import Attention, PoseGate, attention_map, joint_quaternions
+from avatar.implicit.networks import Attention, PoseGate, attention_map, joint_quaternions
 
 CHAIN = (-1, 0, 1, 2, 3, 4)  # a snake
 FORK = (-1, 0, 1, 0, 3)  # two arms of two joints

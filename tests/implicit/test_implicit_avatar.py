@@ -8,10 +8,10 @@ from tiny import tiny_pose
 
 from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
+from avatar.canonical.fields import BodyField
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig, PoseInput, sample_mesh
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.implicit.fields import BodyField
 from avatar.implicit.losses import QueryPoints, query_field
 from avatar.implicit.networks import MlpConfig, SdfConfig
 from avatar.records import Mesh
@@ -120,9 +120,8 @@ def test_the_bodys_own_surface_is_posed_as_the_body_is():
 
 def test_samples_lie_on_the_posed_mesh_with_its_normals_outwards():
     avatar = make_avatar()
-    mesh = avatar.posed_mesh(REST[0], COARSE)
-    cloud = avatar.sample(REST[0], 3000, seed=1, config=COARSE)
-    again = sample_mesh(mesh, 3000, seed=1)
+    mesh = avatar.pose_mesh(avatar.canonical_mesh(REST[0], COARSE), REST[0])
+    cloud, again = sample_mesh(mesh, 3000, seed=1), sample_mesh(mesh, 3000, seed=1)
     np.testing.assert_array_equal(cloud.points, again.points)
     distance, _ = cKDTree(mesh.vertices).query(cloud.points)
     assert distance.max() < (BOX[1] - BOX[0]).max() / 32  # no triangle is larger than its cell

@@ -14,12 +14,12 @@ def sphere_values(radius=0.5, off=0.0, slope=1.0, flip=1.0, colors=None):
     torch.manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(2, 60, 3), dim=-1)
     space = torch.randn(2, 80, 3)
-    empty = 0.5 + 0.3 * torch.rand(2, 40)
+    uniform = 0.5 + 0.3 * torch.rand(2, 40)
     gradients = flip * slope * directions
     outward = flip * slope * torch.nn.functional.normalize(space, dim=-1)
     surface = torch.full((2, 60), off)
-    rim = torch.full((2, 30), flip * 0.4)
-    return FieldValues(surface, gradients, outward, empty - radius, rim, colors), directions
+    boundary = torch.full((2, 30), flip * 0.4)
+    return FieldValues(surface, gradients, outward, uniform - radius, boundary, colors), directions
 
 
 def test_a_true_distance_loses_nothing_but_what_empty_space_costs():

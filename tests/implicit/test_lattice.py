@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from avatar.body.open import open_body
+from avatar.canonical.fields import BodyField
 from avatar.checks import AvatarError
-from avatar.implicit.fields import BodyField, FieldLattice
+from avatar.implicit.networks import FieldLattice
 
 BOX = torch.tensor([[-0.5, 0.0, -0.2], [0.5, 0.73, 0.3]])
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 from spheres import sphere_template
 
+from avatar.canonical.fields import BodyField
 from avatar.checks import AvatarError
 from avatar.implicit.avatar import ImplicitAvatar, ImplicitConfig
-from avatar.implicit.fields import BodyField
 from avatar.implicit.losses import (
     ImplicitLossConfig,
     QueryConfig,
@@ -31,7 +31,9 @@ def make_avatar(**switches):
 
 def draw(seed=0, **counts):
     scan = torch.nn.functional.normalize(torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(9)), dim=-1)
-    config = QueryConfig(**({"near_points": 400, "box_points": 300, "rim_points": 200, "near_distance": 0.1} | counts))
+    config = QueryConfig(
+        **({"near_points": 400, "box_points": 300, "boundary_points": 200, "near_distance": 0.1} | counts)
+    )
     return scan, sample_queries(scan, 10 + TEMPLATE.vertices, BOX, config, torch.Generator().manual_seed(seed))
 
 
@@ -97,7 +99,7 @@ def learn(loss: ImplicitLossConfig, steps=90, **switches):
     avatar = make_avatar(**switches)
     optimiser = torch.optim.Adam([p for p in avatar.parameters() if p.requires_grad], lr=5e-3)
     generator = torch.Generator().manual_seed(0)
-    config = QueryConfig(near_points=200, box_points=150, rim_points=60, near_distance=0.15)
+    config = QueryConfig(near_points=200, box_points=150, boundary_points=60, near_distance=0.15)
     for _ in range(steps):
         normals = torch.nn.functional.normalize(torch.randn(1, 200, 3, generator=generator), dim=-1)
         normals = torch.where(normals[..., 1:2] < -0.3, -normals, normals)

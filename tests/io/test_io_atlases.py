@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from avatar.checks import DataError
-from avatar.io.atlases import read_obj_atlas
-from avatar.io.meshes import read_mesh
+from avatar.io.meshes import read_mesh, read_obj_atlas
 
 # Two squares beside each other, folded at the edge 1-4; the right one's island lies apart in the atlas.
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 1], [0, 1, 0], [1, 1, 0], [2, 1, 1]], float)

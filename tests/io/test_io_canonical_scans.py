@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avatar.checks import AvatarError, DataError
-from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
+from avatar.io.frames import read_canonical_scan, write_canonical_scan
 from avatar.io.npz import read_arrays, write_arrays
 from avatar.records import CanonicalScan
 

@@ -75,7 +75,7 @@ def test_a_line_waits_while_another_process_writes_one(tmp_path):
     assert len(ledger.path.read_bytes().splitlines()) == 3
 
 
-SCORING = ("avatar.evaluation.floors", "avatar.data.layouts")
+SCORING = ("avatar.evaluation.scoring", "avatar.data.layouts")
 
 
 def test_the_code_that_counts_is_what_a_program_loads_to_run_it():
@@ -94,7 +94,7 @@ def test_the_code_that_counts_is_what_a_program_loads_to_run_it():
     ("module", "counts"),
     [
         ("avatar.evaluation.metrics", True),
-        ("avatar.geometry.distances", True),  # which metrics import
+        ("avatar.geometry.neighbours", True),  # which metrics import
         ("avatar.data.scanner", True),
         ("avatar.evaluation.plots", False),
         ("avatar.training.trainer", False),

@@ -12,18 +12,17 @@ from limbs import arm_frame, arm_template, legs_template, skirt_frame
 import avatar.methods.canonicalizer as cycles
 from avatar.body.packed import read_template
 from avatar.body.skinning import skin_transforms
-from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig, Latent
+from avatar.canonical.canonicalizer import TERMS, Canonicalizer, CanonicalizerConfig, Latent, cycle_loss
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.losses import TERMS, canonicalization_loss
-from avatar.canonical.posed import DrawConfig, prepare_scan, to_root_frame
+from avatar.canonical.scans import DrawConfig, prepare_scan, to_root_frame
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset
 from avatar.data.scanner import ScanConfig
-from avatar.evaluation.canonical_scores import CANONICAL_METRICS
+from avatar.evaluation.canonical import CANONICAL_METRICS
 from avatar.evaluation.scores import read_scores
 from avatar.geometry import neighbours
 from avatar.geometry.transforms import transform_points
-from avatar.io.canonical_scans import read_canonical_scan
+from avatar.io.frames import read_canonical_scan
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import (
@@ -133,9 +132,9 @@ def test_each_stage_follows_its_own_schedule(tmp_path, monkeypatch):
 
     def watch(cycle, batch, template, config, progress):
         seen.append((trainer.optimiser.param_groups[0]["lr"], cycle.reposed is not None, progress))
-        return canonicalization_loss(cycle, batch, template, config, progress)
+        return cycle_loss(cycle, batch, template, config, progress)
 
-    monkeypatch.setattr(cycles, "canonicalization_loss", watch)
+    monkeypatch.setattr(cycles, "cycle_loss", watch)
     drawn = []
     for trainer.step in range(12):
         drawn.append(trainer.task.inputs_at(trainer.step)[0].points[:, 0])
@@ -168,7 +167,7 @@ def test_a_code_is_found_at_its_own_falling_rate_from_new_points_every_step(monk
         seen.append((batch.points[0, 0], progress))
         return SimpleNamespace(total=cycle.codes.sum())
 
-    monkeypatch.setattr(cycles, "canonicalization_loss", steady)
+    monkeypatch.setattr(cycles, "cycle_loss", steady)
     config = CycleConfig(code_steps=4, code_lr=0.01, draw=DRAW)
     found = fit_latent(model, TEMPLATE, SCANS[2], model.codes[0], config)
     expected = model.codes[0] - 0.01 * (1 + 1 + 0.1 + 0.01)  # Adam under a constant gradient moves by the rate
@@ -390,7 +389,7 @@ def test_canonical_scores_are_measured_again_when_their_code_or_the_scans_change
         return len(measured)
 
     assert [count(1), count(1)] == [6, 0]  # two splits of a frame, two baselines and the true weights
-    change_source("avatar.evaluation.canonical_scores")
+    change_source("avatar.evaluation.canonical")
     assert [count(2), count(2)] == [6, 0]
     assert found[0] == found[1] != found[2] == {method: 2 * value for method, value in found[0].items()}
     written = read_scores(config.folder / "scores.csv").rows

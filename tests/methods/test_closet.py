@@ -11,7 +11,7 @@ from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import transform_directions, transform_points
-from avatar.methods.closet import ClosetAvatar, ClosetConfig, PoseLocality, Skinning
+from avatar.methods.closet import FREE_RATE, ClosetAvatar, ClosetConfig, PoseLocality, Skinning
 from avatar.methods.registry import find_method
 from avatar.nn.decoders import Decoded
 from avatar.nn.encoders import PointNet2Config
@@ -77,17 +77,19 @@ def test_template_is_one_for_all_poses_and_differs_by_outfit():
     torch.testing.assert_close(template.points[0], resting + prediction.garment_offsets[0])
 
 
-def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
+@pytest.mark.parametrize("rest_vertices", [True, False])
+def test_each_frame_is_decoded_from_its_own_outfit_and_pose(rest_vertices):
     """CloSET eq. 3, frame by frame; outfits that are neither all there nor in their order, and codes that matter."""
     torch.manual_seed(0)
-    model = ClosetAvatar(TEMPLATE, 3, small_config(code_std=1.0)).eval()
+    model = ClosetAvatar(TEMPLATE, 3, small_config(code_std=1.0, rest_vertices=rest_vertices)).eval()
     batch, samples = replace(random_batch(), outfit_ids=torch.tensor([2, 1, 2])), template_points()
     prediction = model(batch, samples)
     scale, skin = model.config.offset_scale, vertex_normals(TEMPLATE.vertices, TEMPLATE.faces)
     for frame, outfit in enumerate(batch.outfit_ids):
         garment = model.garment_features(model.codes[None, outfit], samples)
         places = interpolate(TEMPLATE.vertices, samples)
-        pose = interpolate(model.pose_encoder(batch.pose_vertices[None, frame]), samples)
+        seen = [batch.pose_vertices[None, frame], *([TEMPLATE.vertices[None]] if rest_vertices else [])]
+        pose = interpolate(model.pose_encoder(torch.cat(seen, dim=-1)), samples)
         template = model.garment_decoder(garment, places)
         wrinkles = model.pose_decoder(torch.cat([pose, garment], dim=-1), places)
         expected = {
@@ -101,6 +103,29 @@ def test_each_frame_is_decoded_from_its_own_outfit_and_pose():
         added = added @ batch.vertex_transforms[frame, 0, :3, :3].T
         torch.testing.assert_close(prediction.normals[frame], torch.nn.functional.normalize(added, dim=-1))
     torch.testing.assert_close(prediction.codes, model.codes[1:])  # each outfit of the batch once
+
+
+def test_decoders_may_see_the_code_itself_and_vertices_have_offsets_of_their_own():
+    torch.manual_seed(0)
+    model = ClosetAvatar(TEMPLATE, 2, small_config(code_std=1.0, code_skip=True, free_offsets=True)).eval()
+    batch, samples, channels = random_batch(), template_points(), model.config.code_channels
+    features = model.garment_features(model.codes, samples)
+    own = interpolate(model.codes[..., :channels], samples)
+    torch.testing.assert_close(features[..., -channels:], own)
+    assert (model.codes[..., channels:] == 0).all()
+    before, rest = model(batch, samples), model.garment_template(1, samples)
+    free = torch.randn(len(TEMPLATE.vertices), 3)
+    model.codes.data[1, :, channels:] = free
+    moved, added = model(batch, samples), interpolate(free, samples) * FREE_RATE * model.config.offset_scale
+    for frame, outfit in enumerate(batch.outfit_ids):
+        expected = added if outfit == 1 else torch.zeros_like(added)
+        found = moved.garment_offsets[frame] - before.garment_offsets[frame]
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(
+        model.garment_template(1, samples).offsets - rest.offsets, added[None], rtol=1e-4, atol=1e-6
+    )
+    with pytest.raises(AvatarError, match="free_offsets: they are part of the explicit template"):
+        small_config(free_offsets=True, template=False)
 
 
 def test_the_garment_template_is_the_prediction_at_rest_without_wrinkles():
@@ -173,7 +198,8 @@ def test_pose_noise_acts_in_training_only(monkeypatch):
     encode, seen = noisy.pose_encoder.forward, []
     monkeypatch.setattr(noisy.pose_encoder, "forward", lambda vertices: seen.append(vertices) or encode(vertices))
     noisy(batch, samples)
-    assert float((seen[0] - batch.pose_vertices).std()) == pytest.approx(0.1, rel=0.1)  # metres
+    assert float((seen[0][..., :3] - batch.pose_vertices).std()) == pytest.approx(0.1, rel=0.1)  # metres
+    assert torch.equal(seen[0][..., 3:], TEMPLATE.vertices.expand_as(batch.pose_vertices))  # without noise
 
 
 def test_every_parameter_gets_a_gradient():

@@ -18,7 +18,7 @@ from avatar.config import compose_settings
 from avatar.data.splits import SplitConfig
 from avatar.geometry.surface import interpolate, sample_surface
 from avatar.geometry.transforms import transform_points
-from avatar.io.canonical_scans import write_canonical_scan
+from avatar.io.frames import write_canonical_scan
 from avatar.methods.canonicalizer import canonical_outfits, canonicalizer_folder
 from avatar.methods.closet import learned_skinning
 from avatar.methods.losses import LossConfig

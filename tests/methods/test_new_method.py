@@ -14,8 +14,7 @@ from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.evaluation.scoring import ScoreConfig
-from avatar.geometry.distances import point_to_point
-from avatar.geometry.neighbours import correspond
+from avatar.geometry.neighbours import correspond, point_to_point
 from avatar.geometry.sparse import gather_rows
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import transform_directions

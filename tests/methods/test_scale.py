@@ -33,9 +33,9 @@ def square() -> Template:
 
 def test_paper_has_798_patches_of_16_or_64_points():
     model = avatar(square(), map_size=32, patches=798)
-    assert len(model.patch_pixels) == len(model.patch_pixels.unique()) == 798
+    assert len(model.patch_rows) == len(model.patch_rows.unique()) == 798
     assert [len(model.template_samples(points).face_ids) for points in (12_768, 51_072)] == [12_768, 51_072]
-    assert len(avatar(square(), map_size=8, patches=798).patch_pixels) == 64
+    assert len(avatar(square(), map_size=8, patches=798).patch_rows) == 64
 
 
 def test_patches_are_spread_over_the_body():
@@ -63,7 +63,7 @@ def test_frame_is_two_edges_and_a_normal_as_long_as_edges_are():
     model = avatar(square(), map_size=8, patches=64)
     posed = torch.tensor([[[0.0, 0, 0], [3, 0, 0], [3, 4, 0], [0, 4, 0]]])
     frames = model.patch_frames(posed)
-    lower = model.patch_face_ids == 0
+    lower = model.patches.face_ids == 0
     mean = ((3 + 5) * lower.sum() + (5 + 4) * (~lower).sum()) / 2 / 64
     expected = torch.stack([torch.tensor([3.0, 0, 0]), torch.tensor([3.0, 4, 0]), torch.tensor([0, 0, mean])], dim=-1)
     torch.testing.assert_close(frames[0, lower], expected.expand(int(lower.sum()), -1, -1))

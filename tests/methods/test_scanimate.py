@@ -7,14 +7,15 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from avatar.canonical.scans import NearestBody, canonicalize_scan
+from avatar.canonical.fields import BodyField
+from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError, DataError
-from avatar.data.canonical_frames import CanonicalFrames, canonical_frame
+from avatar.data.batches import CanonicalFrames, canonical_frame
 from avatar.data.splits import SplitConfig
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.implicit.losses import QueryConfig
-from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.checkpoints import load_checkpoint
+from avatar.io.frames import read_canonical_scan, write_canonical_scan
 from avatar.io.meshes import read_mesh
 from avatar.io.points import read_points
 from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
@@ -22,11 +23,11 @@ from avatar.methods.scanimate import ImplicitTask, ImplicitTrainConfig
 from avatar.methods.settings import MethodChoice, Precision, RunConfig, Schedule, TrainConfig
 from avatar.records import Scan
 from avatar.runs.canonicalizing import train_canonicalizer
-from avatar.runs.prediction import predict_frames, predict_motion
+from avatar.runs.prediction import predict_frames
 from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
 from avatar.settings import settings_to_dict
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 from avatar.training.logs import read_log
 from avatar.training.trainer import Trainer
 
@@ -37,7 +38,7 @@ SETTINGS = {
         "gate_spacing": 0.06,
     },
     "train": {
-        "probes": {"near_points": 300, "box_points": 100, "rim_points": 60, "near_distance": 0.05},
+        "queries": {"near_points": 300, "box_points": 100, "boundary_points": 60, "near_distance": 0.05},
         "loss": {"surface": 10.0},
         "decay_at": [],
     },
@@ -58,7 +59,7 @@ def settings(tiny_folder, tiny_outfit, tmp_path_factory) -> RunConfig:
     runs = tmp_path_factory.mktemp("runs")
     where = {"dataset": tiny_folder.parent.name, "data_root": tiny_folder.parents[1], "runs_root": runs}
     folder = train_canonicalizer(CanonicalizeConfig(outfit=tiny_folder.name, weights=WeightSource.knn, **where))
-    source = NearestBody(tiny_outfit.template, 6)
+    source = BodyField(tiny_outfit.template, 6)
     for name in tiny_outfit.frames("train"):
         frame = tiny_outfit.load("train", name)
         weights = source.weights_of(frame.scan.points, frame)
@@ -99,10 +100,8 @@ def test_predictions_lie_on_the_posed_scans(trained, tiny_outfit, tmp_path):
     avatar = load_avatar(trained)
     assert (avatar.steps, avatar.config.method.name) == (120, "scanimate") and not avatar.model.training
     names = tiny_outfit.frames("test")
-    clouds = predict_frames(
-        avatar, tiny_outfit, "test", tmp_path / "p", tmp_path / "m", 4000, COARSE, lambda name: name != names[0]
-    )
-    assert [path.stem for path in clouds] == list(names[1:])
+    clouds = predict_frames(avatar, tiny_outfit, "test", tmp_path / "p", tmp_path / "m", 4000, COARSE)
+    assert [path.stem for path in clouds] == list(names)
     for path in clouds:
         cloud, scan = read_points(path), tiny_outfit.load("test", path.stem).scan
         assert cloud.points.shape == (4000, 3)
@@ -112,22 +111,13 @@ def test_predictions_lie_on_the_posed_scans(trained, tiny_outfit, tmp_path):
         mesh = read_mesh(tmp_path / "m" / path.name)
         red = mesh.colors[:, 0] > 0.5
         assert mesh.vertices[red, 1].mean() > mesh.vertices[~red, 1].mean() + 0.3
-    again = predict_frames(
-        load_avatar(trained),
-        tiny_outfit,
-        "test",
-        tmp_path / "q",
-        tmp_path / "n",
-        4000,
-        COARSE,
-        lambda name: name == names[1],
-    )
-    assert again[0].read_bytes() == clouds[0].read_bytes()
+    again = predict_frames(load_avatar(trained), tiny_outfit, "test", tmp_path / "q", tmp_path / "n", 4000, COARSE)
+    assert [path.read_bytes() for path in again] == [path.read_bytes() for path in clouds]
 
 
 def test_a_motion_is_predicted_frame_by_frame(trained, tiny_outfit, tmp_path):
     motion = authored_motion("walk", fps=4, seconds=0.5)
-    posed = predict_motion(
+    posed = predict_frames(
         load_avatar(trained), tiny_outfit, motion, tmp_path / "p", tmp_path / "m", 1000, ExtractionConfig(32)
     )
     assert len(posed) == len(motion.poses) and posed[0].name == "walk.00000.ply"
@@ -161,8 +151,8 @@ def make_trainer(trained, tiny_outfit, tmp_path, frames):
     def make(settings: ImplicitTrainConfig | None = None, **options) -> Trainer:
         avatar = load_avatar(trained)
         train = replace(avatar.config.train, schedule=Schedule.constant, **options)
-        probes = QueryConfig(near_points=60, box_points=20, rim_points=20)
-        settings = replace(settings or ImplicitTrainConfig(), probes=probes)
+        queries = QueryConfig(near_points=60, box_points=20, boundary_points=20)
+        settings = replace(settings or ImplicitTrainConfig(), queries=queries)
         data = CanonicalFrames(frames, 50, seed=3)
         task = ImplicitTask(avatar.model, tiny_outfit.template.vertices, train, settings, data)
         return Trainer(task, train, tmp_path)
@@ -244,7 +234,7 @@ def test_batches_depend_on_nothing_but_the_step(frames):
 
 
 def test_mirrored_frames_are_the_mirror_image_of_scan_and_pose(frames, tiny_outfit):
-    from avatar.data.mirroring import ACROSS, mirror_coins, mirror_map
+    from avatar.data.batches import ACROSS, mirror_coins, mirror_map
 
     symmetry = mirror_map(tiny_outfit.template)
     plain, mirrored = CanonicalFrames(frames, 50, 0), CanonicalFrames(frames, 50, 0, symmetry)

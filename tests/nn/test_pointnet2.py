@@ -1,5 +1,7 @@
 """The surface encoder against per-neighbour loops, parameter counts and invariances."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from reference import ball_loop
@@ -22,6 +24,7 @@ def parameters(module: torch.nn.Module) -> int:
 def test_full_encoders_and_decoders_have_the_published_sizes():
     template = open_body().template
     assert parameters(PointNet2(template, 3, PointNet2Config())) == 10_243_136
+    assert parameters(PointNet2(template, 6, ClosetConfig().pose_encoder, relative=True)) == 10_244_096
     assert parameters(PointNet2(template, 64, PointNet2Config(**FULL_GARMENT_ENCODER))) == 280_928
     assert [parameters(ShapeDecoder(c, DecoderConfig())) for c in (67, 131, 132)] == [567_046, 599_814, 600_326]
     assert ClosetConfig().code_channels == 64
@@ -49,18 +52,38 @@ def test_groups_are_the_balls_of_each_level_s_radius():
         assert max(len(set(group)) for group in slow) < level.groups.shape[1]  # no ball is full
 
 
-def test_set_abstraction_equals_the_layer_applied_to_every_neighbour():
+@pytest.mark.parametrize("differences", [False, True])
+def test_set_abstraction_equals_the_layer_applied_to_every_neighbour(differences):
     torch.manual_seed(0)
     level = build_levels(sphere_template().vertices, SIZES)[0]
-    layer = SetAbstraction(level, 5, (8, 7)).double().eval()
+    layer = SetAbstraction(level, 5, (8, 7), relative=differences).double().eval()
     features = torch.randn(2, len(level.finer_positions), 5, dtype=torch.float64)
     weight = torch.cat([layer.feature_layer.weight, layer.position_layer.weight], dim=1)
+    if differences:
+        weight = torch.cat([weight, layer.difference_layer.weight], dim=1)
     slow = []
     for centre, group in enumerate(level.groups):
         relative = (level.finer_positions[group] - level.positions[centre]).expand(2, -1, -1)
         joined = torch.cat([features[:, group], relative], dim=-1)
+        if differences:
+            own = (level.finer_positions == level.positions[centre]).all(dim=1).nonzero().item()
+            joined = torch.cat([joined, (features[:, group] - features[:, [own]]) / level.radius], dim=-1)
         slow.append(layer.rest(layer.first(joined @ weight.T + layer.feature_layer.bias)).amax(dim=1))
     torch.testing.assert_close(layer(features), torch.stack(slow, dim=1))
+
+
+def test_the_first_abstraction_alone_is_relative_and_groups_may_be_the_nearest_points():
+    encoder = PointNet2(sphere_template(), 3, PointNet2Config(SIZES, ((8,), (9,)), ((7,), (4,))), relative=True)
+    assert [layer.difference_layer is not None for layer in encoder.abstractions] == [True, False]
+    points = sphere_template().vertices
+    nearest = build_levels(points, replace(SIZES, radii=(0.8, 1.5), spread=False))[0]
+    reach, found = (  # on the sphere many points are equally near
+        (points[groups] - nearest.positions[:, None]).norm(dim=-1)
+        for groups in (torch.tensor(ball_loop(nearest.positions.numpy(), points.numpy(), 0.8, 6)), nearest.groups)
+    )
+    torch.testing.assert_close(found, reach)
+    spread = build_levels(points, replace(SIZES, radii=(0.8, 1.5)))[0]
+    assert torch.equal(spread.positions, nearest.positions) and not torch.equal(spread.groups, nearest.groups)
 
 
 def test_groups_are_rows_of_the_finer_level():

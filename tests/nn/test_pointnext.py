@@ -39,7 +39,8 @@ def test_levels_see_positions_in_units_of_their_radius_and_blocks_twice_as_far()
         assert torch.equal(down.level.groups, level.groups)
         around = block.aggregation.level
         torch.testing.assert_close(around.positions * 2 * radius, level.positions)
-        expected = ball_query(level.positions, level.positions, 2 * radius, min(WIDE.neighbours, len(level.groups)))
+        count, ranks = min(WIDE.neighbours, len(level.groups)), torch.arange(len(level.positions))
+        expected = ball_query(level.positions, level.positions, 2 * radius, count, ranks)
         assert torch.equal(around.groups, expected)
         reach = (level.positions[around.groups] - level.positions[:, None]).norm(dim=-1)
         assert radius < reach.max() <= 2 * radius + 1e-6

@@ -4,9 +4,9 @@ import csv
 
 import pytest
 
-from avatar.evaluation.forms import Axis, FormConfig
 from avatar.evaluation.scores import FrameScore, Score, Scores, read_scores, write_scores
-from avatar.pipeline.comparison import CompareConfig, compare
+from avatar.evaluation.tables import Axis, FormConfig
+from avatar.pipeline.reporting import CompareConfig, compare
 from avatar.pipeline.scores import floors_folder, scores_file
 
 VALUES = {  # 1e-4 m², two frames each

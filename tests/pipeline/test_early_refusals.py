@@ -13,11 +13,10 @@ from avatar.evaluation.scores import Score, Scores, write_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.methods.canonicalizer import CanonicalizeConfig
 from avatar.methods.settings import MethodChoice, RunConfig
-from avatar.pipeline import canonicalization, demo, experiments, scores
+from avatar.pipeline import canonicalization, experiments, scores
 from avatar.pipeline.canonicalization import canonicalize
-from avatar.pipeline.comparison import CompareConfig
-from avatar.pipeline.demo import DemoConfig
-from avatar.pipeline.experiments import ExperimentConfig, experiment, has_baseline
+from avatar.pipeline.experiments import DemoConfig, ExperimentConfig, demo, experiment, has_baseline
+from avatar.pipeline.reporting import CompareConfig
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict
 from avatar.runs.training import train as train_run
 from avatar.simulate.recording import SimulateConfig
@@ -57,8 +56,7 @@ def idle(monkeypatch):
 
     for module, names in {
         canonicalization: ("train_canonicalizer",),
-        experiments: ("train", "train_canonicalizer"),
-        demo: ("canonicalize", "train"),
+        experiments: ("train", "make_canonical_scans", "canonicalize"),
     }.items():
         for name in names:
             monkeypatch.setattr(module, name, refuse)
@@ -83,7 +81,7 @@ def test_pictures_and_meshes_on_a_machine_that_cannot_make_them(untruthful, tiny
     def refuse():
         raise AvatarError("cannot draw")
 
-    for module in (canonicalization, experiments, demo):
+    for module in (canonicalization, experiments):
         monkeypatch.setattr(module, "load_pyvista", refuse)
     with pytest.raises(AvatarError, match="cannot draw"):
         canonicalize(CanonicalizeConfig(outfit="coat", **untruthful))
@@ -91,17 +89,17 @@ def test_pictures_and_meshes_on_a_machine_that_cannot_make_them(untruthful, tiny
     with pytest.raises(AvatarError, match="cannot draw"):
         experiment(ExperimentConfig(**where))
     with pytest.raises(AvatarError, match="cannot draw"):
-        demo.demo(DemoConfig(**where))
+        demo(DemoConfig(**where))
     monkeypatch.setattr("avatar.export.meshing.find_spec", lambda name: None)
     with pytest.raises(AvatarError, match="meshing needs open3d"):
-        demo.demo(DemoConfig(**where))
+        demo(DemoConfig(**where))
 
 
 def test_an_experiment_without_what_its_scores_need(untruthful, idle):
     with pytest.raises(DataError, match=r"coat/test"):
         experiment(ExperimentConfig(outfit=("coat",), **untruthful))
     with pytest.raises(DataError, match=r"coat/test"):
-        demo.demo(DemoConfig(outfit=("coat",), **untruthful))
+        demo(DemoConfig(outfit=("coat",), **untruthful))
     with pytest.raises(AvatarError, match="points: expected 1,000"):
         ExperimentConfig(points=10)
     with pytest.raises(AvatarError, match="points: expected 1,000"):

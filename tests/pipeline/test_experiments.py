@@ -16,19 +16,19 @@ from avatar.checks import AvatarError
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
 from avatar.evaluation import scoring
-from avatar.evaluation.forms import Axis, FormConfig, ReportedTable
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
+from avatar.evaluation.tables import Axis, FormConfig, ReportedTable
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
 from avatar.methods.settings import MethodChoice
-from avatar.pipeline.comparison import CompareConfig, compare
 from avatar.pipeline.experiments import ExperimentConfig, experiment, tabulate_experiment
+from avatar.pipeline.reporting import CompareConfig, compare
 
 ROOT = Path(__file__).parents[2]
 METRICS = ("cd_point", "normal_l1")
 IMPLICIT = {"avatar": {"sdf": {"widths": [24, 24, 24], "skip": 1, "orders": 4}, "gate_spacing": 0.1}}
-IMPLICIT["train"] = {"probes": {"near_points": 100, "box_points": 50, "rim_points": 30}, "decay_at": []}
+IMPLICIT["train"] = {"queries": {"near_points": 100, "box_points": 50, "boundary_points": 30}, "decay_at": []}
 
 
 @pytest.fixture(scope="module")
@@ -79,15 +79,15 @@ def test_a_job_leaves_predictions_and_scores_with_what_tells_it_apart(jobs):
 
 
 def test_what_is_finished_is_not_done_again_and_what_changed_is(jobs, monkeypatch, change_source):
-    run, drawn, real = jobs[1].run.folder, [], scoring.draw_scan
-    monkeypatch.setattr(scoring, "draw_scan", lambda frame, config: drawn.append(frame.name) or real(frame, config))
+    run, read, real = jobs[1].run.folder, [], scoring.read_points
+    monkeypatch.setattr(scoring, "read_points", lambda path: read.append(path.name) or real(path))
     (run / "scored.txt").write_text("of an older version: not believed")
 
     def again(job: ExperimentConfig) -> int:
         """How many predictions the job scores."""
-        drawn.clear()
+        read.clear()
         experiment(job)
-        return len(drawn)
+        return len(read)
 
     cloud = run / "predictions" / "test" / "tiny" / "check.00000.ply"
     before = {path: path.read_bytes() for path in (cloud, run / "avatar.safetensors", run / "scores.csv")}
@@ -119,6 +119,25 @@ def test_the_table_has_every_form(jobs):
     assert len([row for row in rows if row.method in ("static", "closet")]) == expected
     sheet = np.asarray(Image.open(out / "small.poses.jpg"))
     assert 2 * 600 < sheet.shape[0] < 3 * 600 and 4 * 400 < sheet.shape[1] < 5 * 400  # two poses, three methods, truth
+
+
+def test_budgets_have_a_table_each_and_one_file_of_scores(jobs, tmp_path):
+    longer = replace(jobs[1], train=replace(jobs[1].train, steps=5), compare=replace(jobs[1].compare, out=tmp_path))
+    other = replace(longer, train=replace(longer.train, seed=1), one_seed=("closet",))
+    experiment(longer)
+    assert experiment(other) == [] and not other.run.folder.exists()
+    shorter = [replace(job, compare=longer.compare) for job in jobs[:2]]
+    assert tabulate_experiment([*shorter, longer, other]) == tmp_path / "small.csv"
+    assert "Equal steps: 4 each." in (tmp_path / "small_4steps.md").read_text()
+    with pytest.raises(AvatarError, match="one_seed: expected a job of seed 0"):
+        tabulate_experiment([other])
+    with pytest.raises(AvatarError, match="one_seed: expected variants of conf/method, got clsoet"):
+        replace(other, one_seed=("clsoet",))
+    with pytest.raises(AvatarError, match=r"compare\.table: expected a plain name"):
+        replace(other, compare=replace(other.compare, table="a" * 60))
+    assert "Equal steps: 5 each." in (tmp_path / "small_5steps.md").read_text()
+    rows = [row for row in read_scores(tmp_path / "small.csv").rows if row.method == "closet"]
+    assert {(row.table, row.steps) for row in rows} == {("small_4steps", 4), ("small_5steps", 5)}
 
 
 def test_scores_of_a_foreign_program_stand_in_the_same_table(jobs, tmp_path, tiny_folder):

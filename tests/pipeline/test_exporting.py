@@ -15,7 +15,7 @@ from avatar.io.points import read_points, write_points
 from avatar.pipeline.scores import PredictConfig, meshes_folder, predict, predicted_fps
 from avatar.pipeline.surfaces import ExportConfig, export, numbered_frames
 from avatar.records import Mesh, PointCloud
-from avatar.simulate.sequences import authored_motion
+from avatar.simulate.angles import authored_motion
 
 Usd = pytest.importorskip("pxr.Usd")
 

@@ -9,7 +9,7 @@ import pytest
 from concurrent_jobs import WAIT, run_at_once
 
 from avatar.checks import AvatarError, DataError
-from avatar.evaluation import floors, scoring
+from avatar.evaluation import scoring
 from avatar.evaluation.metrics import METRICS as METRIC_TABLE
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
@@ -105,14 +105,14 @@ def test_scores_are_made_again_when_a_metric_or_a_prediction_changes_and_not_els
     predict(PredictConfig(run=run, points=1500, device="cpu"))
     config = EvaluateConfig(runs=(run,), score=ScoreConfig(scan_points=300, metrics=METRICS))
     before = {(row.method, row.metric): row.value for row in evaluate(config).rows}
-    calls = count(scoring, "draw_scan"), count(floors, "draw_scan")
+    predictions, every = count(scoring, "read_points"), count(scoring, "draw_scan")
 
     def again() -> tuple[int, int]:
         """How many predictions and floors a call scores."""
-        for made in calls:
-            made.clear()
+        predictions.clear()
+        every.clear()
         evaluate(config)
-        return len(calls[0]), len(calls[1])
+        return len(predictions), len(every) - len(predictions)
 
     change_source("avatar.evaluation.plots")
     change_source("avatar.pipeline.experiments")
@@ -134,16 +134,17 @@ def test_scores_are_made_again_when_a_metric_or_a_prediction_changes_and_not_els
 
 def test_floors_keep_the_metrics_and_the_point_counts_of_earlier_tables(run, count, capsys):
     """Tables of one outfit ask for other metrics, and methods for other point counts: none takes another's away."""
-    counted = count(floors, "draw_scan")
+    predictions, every = count(scoring, "read_points"), count(scoring, "draw_scan")
 
     def ask(metrics: list[str], points: int = 1500, seed: int = 0) -> tuple[set[str], set[str], int]:
-        counted.clear()
+        predictions.clear()
+        every.clear()
         predict(PredictConfig(run=run, points=points, device="cpu"))
         config = EvaluateConfig(runs=(run,), score=ScoreConfig(scan_points=400, metrics=metrics, seed=seed))
         shown = {row.metric for row in evaluate(config).rows if row.method in ("sampling", "body")}
         file = floors_folder(run.parents[3], "open", run.parent.name, points) / "scores.csv"
         assert {row.points for row in read_scores(file).rows} == {points}
-        return shown, {row.metric for row in read_scores(file).rows}, len(counted)
+        return shown, {row.metric for row in read_scores(file).rows}, len(every) - len(predictions)
 
     both = {"normal_l1", "cd_point"}
     assert ask(["cd_point"]) == ({"cd_point"}, {"cd_point"}, 4)

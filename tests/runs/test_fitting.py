@@ -118,12 +118,14 @@ def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_pos
         for name in outfit.frames("test"):
             frame = outfit.load("test", name)
             cloud = predict(avatar.model, body_batch([frame.body], 0, (name,)), samples)
-            errors.append(float(cKDTree(cloud.points).query(frame.scan.points)[0].mean()))
+            perfect = outfit.resample("test", name, 3000, 1)
+            found, floor = (cKDTree(c.points).query(frame.scan.points)[0].mean() for c in (cloud, perfect))
+            errors.append(float(found - floor))  # as many points of the true surface are not nearer
         return sum(errors) / len(errors)
 
     codes = base.model.codes.detach()
     tight, start = (error(base, code) for code in (codes[0], codes.mean(dim=0)))
-    assert error(fitted, fitted.model.codes[0].detach()) < 0.7 * min(tight, start)
+    assert error(fitted, fitted.model.codes[0].detach()) < 0.5 * min(tight, start)
 
 
 def test_another_subject_s_field_is_not_fitted():

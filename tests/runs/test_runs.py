@@ -1,30 +1,33 @@
 """Runs on a simulated outfit: learning beats the static floor, folders come back as avatars, errors are clear."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from scipy.spatial import cKDTree
 from tiny import SETTINGS, quick_training
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError
-from avatar.data.mirroring import mirror_batch, mirror_coins, mirror_map
+from avatar.data.batches import mirror_batch, mirror_coins, mirror_map
 from avatar.data.splits import SplitConfig, split_outfit
 from avatar.environment import choose_device
 from avatar.io.checkpoints import save_checkpoint
+from avatar.io.documents import read_yaml
 from avatar.io.points import read_points
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.closet import ClosetConfig
 from avatar.methods.points import body_batch, predict, template_samples
 from avatar.methods.registry import find_method
-from avatar.methods.settings import MethodChoice, Precision, RunConfig
-from avatar.runs.prediction import predict_frames, predict_motion
-from avatar.runs.training import choose_weights, load_avatar, mean_template
+from avatar.methods.settings import Clock, MethodChoice, Precision, RunConfig
+from avatar.runs.prediction import predict_frames
+from avatar.runs.training import choose_weights, load_avatar, mean_template, save_settings
 from avatar.runs.training import train as train_run
-from avatar.settings import settings_from_dict
-from avatar.simulate.sequences import authored_motion
+from avatar.settings import settings_from_dict, settings_to_dict
+from avatar.simulate.angles import authored_motion
 from avatar.training.logs import read_log
 from avatar.training.trainer import Trainer
 
@@ -68,15 +71,20 @@ def held_out_error(folder, outfit) -> float:
     return float(np.mean(errors))
 
 
-@pytest.mark.slow
-def test_learning_beats_the_static_floor_on_unseen_poses(settings, trained, tiny_outfit):
+@pytest.fixture(scope="module")
+def still(settings, tiny_outfit) -> float:
+    """The error of the static floor."""
     static = replace(settings, method=MethodChoice("closet", "static", SETTINGS | {"pose": False}))
-    moving, still = held_out_error(trained, tiny_outfit), held_out_error(train_run(static), tiny_outfit)
-    assert moving < 0.85 * still
+    return held_out_error(train_run(static), tiny_outfit)
 
 
 @pytest.mark.slow
-def test_training_in_half_precision_learns_what_float32_learns(settings, trained, tiny_outfit):
+def test_learning_beats_the_static_floor_on_unseen_poses(trained, still, tiny_outfit):
+    assert held_out_error(trained, tiny_outfit) < 0.4 * still  # measured: 0.13 to 0.20 of it, four seeds
+
+
+@pytest.mark.slow
+def test_training_in_half_precision_learns_what_float32_learns(settings, trained, still, tiny_outfit):
     """`train.precision=bf16`, by autocast on the CPU: the loss falls, and unseen poses are about as good."""
     narrow = replace(settings, name="bf16", train=replace(settings.train, precision=Precision.bf16))
     folder = train_run(narrow)
@@ -86,8 +94,7 @@ def test_training_in_half_precision_learns_what_float32_learns(settings, trained
     assert last < first and normals[-1] < 0.8 * normals[0]
     wide, half = ([row for row in rows[each] if row["split"] == "validation"][-1] for each in (trained, folder))
     assert wide["loss"] != half["loss"] and float(half["loss"]) == pytest.approx(float(wide["loss"]), rel=0.02)
-    # another seed in float32 alone makes it 1.27 times as much
-    assert held_out_error(folder, tiny_outfit) < 1.5 * held_out_error(trained, tiny_outfit)
+    assert held_out_error(folder, tiny_outfit) < 0.4 * still  # measured: 0.08 to 0.22 of it, four seeds
 
 
 @pytest.mark.slow
@@ -103,7 +110,7 @@ def test_a_run_comes_back_as_it_was_trained(settings, trained, tiny_outfit, tmp_
     best = load_avatar(trained, "best")
     assert best.steps in (130, 260)
     motion = authored_motion("walk", fps=10, seconds=0.5)
-    posed = predict_motion(avatar, tiny_outfit, motion, tmp_path / "m", tmp_path, 1000)
+    posed = predict_frames(avatar, tiny_outfit, motion, tmp_path / "m", tmp_path, 1000)
     assert len(posed) == len(motion.poses)
     assert np.ptp(read_points(posed[0]).points[:, 1]) > 1.2
 
@@ -113,6 +120,28 @@ def test_going_on_with_other_settings_is_refused(settings, trained):
     with pytest.raises(AvatarError, match=r"train\.lr.*another name"):
         train_run(replace(settings, train=replace(settings.train, lr=1.0)))
     assert train_run(settings) == trained  # finished: nothing left to do, nothing lost
+
+
+@pytest.mark.slow
+def test_runs_of_earlier_versions_go_on_by_the_wall_clock_and_without_spread_groups_are_refused(
+    settings, trained, tmp_path
+):
+    config = replace(settings, runs_root=tmp_path)
+    plain = settings_to_dict(config)
+    del plain["train"]["clock"]
+    config.folder.mkdir(parents=True)
+    (config.folder / "config.yaml").write_text(yaml.safe_dump(plain))
+    with pytest.raises(AvatarError, match=r"other settings \(train\.clock\)"):
+        save_settings(replace(config, train=replace(config.train, clock=Clock.processor)))
+    save_settings(config)
+    assert read_yaml(config.folder / "config.yaml")["train"]["clock"] == "wall"
+    for name in ("avatar.safetensors", "avatar.json", "template.npz"):
+        (config.folder / name).write_bytes((trained / name).read_bytes())
+    facts = json.loads((trained / "avatar.json").read_text())
+    del facts["config"]["method"]["settings"]["garment_encoder"]["hierarchy"]["spread"]
+    (config.folder / "avatar.json").write_text(json.dumps(facts))
+    with pytest.raises(AvatarError, match=r"garment_encoder\.hierarchy\.spread.*train the run again"):
+        load_avatar(config.folder)
 
 
 @pytest.mark.slow

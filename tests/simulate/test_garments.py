@@ -8,9 +8,9 @@ import trimesh
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
 from avatar.simulate.garments import NECK_FOOT, Cutting, cut_garment
-from avatar.simulate.implicit import mesh_edges
+from avatar.simulate.level_sets import mesh_edges
+from avatar.simulate.mesh_queries import body_distances
 from avatar.simulate.outfits import GARMENTS, OUTFIT_NAMES, FabricConfig, GarmentConfig, outfit
-from avatar.simulate.visibility import body_distances
 
 pytest.importorskip("warp")
 
@@ -54,7 +54,7 @@ def test_cut_garments_are_clean_and_outside(name, index, shape):
     shape_factor = 4 * np.sqrt(3) * mesh.area_faces / (sides**2).sum(1)
     assert shape_factor.min() > 0.35  # 1 for an equilateral triangle, 0 for a sliver
     if config.top is None and not config.hood:  # nothing is left on the face
-        assert garment.vertices[:, 1].max() < Cutting.of(body).joints["neck"][1] + NECK_FOOT + 0.01
+        assert garment.vertices[:, 1].max() < Cutting(body).joints["neck"][1] + NECK_FOOT + 0.01
     away = body_distances(body.bind_vertices.numpy(), body.faces.numpy(), garment.vertices, 0.1)
     assert away.min() > config.fabric.thickness - 1e-4
     outward = (mesh.vertex_normals * (garment.vertices - [0, garment.vertices[:, 1].mean(), 0])).sum(1)
@@ -62,7 +62,7 @@ def test_cut_garments_are_clean_and_outside(name, index, shape):
 
 
 def test_levels_run_from_ankle_to_neck():
-    cutting = Cutting.of(open_body("female"))
+    cutting = Cutting(open_body("female"))
     heights = [cutting.height(level) for level in (0, 1, 2, 3, 4, 5)]
     assert heights == sorted(heights) and heights[0] == pytest.approx(cutting.joints["left_ankle"][1])
     assert cutting.height(0.5) == pytest.approx((heights[0] + heights[1]) / 2)
@@ -71,7 +71,7 @@ def test_levels_run_from_ankle_to_neck():
 def test_hems_lie_where_the_levels_say():
     body = open_body("female")
     config = coarse("skirt", 0)
-    garment, cutting = cut_garment(body, config), Cutting.of(body)
+    garment, cutting = cut_garment(body, config), Cutting(body)
     assert garment.vertices[:, 1].min() == pytest.approx(cutting.height(config.bottom), abs=0.015)
     assert garment.vertices[:, 1].max() == pytest.approx(cutting.height(config.top), abs=0.015)
 
@@ -106,7 +106,7 @@ def test_edges_are_an_option_and_cling_stays_the_same_to_an_area():
 
 def test_a_hood_covers_the_head_and_leaves_the_face():
     body = open_body("female")
-    garment, cutting = cut_garment(body, coarse("hoodie", 1)), Cutting.of(body)
+    garment, cutting = cut_garment(body, coarse("hoodie", 1)), Cutting(body)
     assert garment.vertices[:, 1].max() > cutting.vertices[:, 1].max()
     nose = cutting.vertices[np.where(cutting.head > 0.5, cutting.vertices[:, 2], -1).argmax()]
     assert np.linalg.norm(garment.vertices - nose, axis=1).min() > 0.05
@@ -114,7 +114,7 @@ def test_a_hood_covers_the_head_and_leaves_the_face():
 
 def test_wide_legs_stay_apart():
     body = open_body("female")
-    garment, cutting = cut_garment(body, coarse("slacks", 0)), Cutting.of(body)
+    garment, cutting = cut_garment(body, coarse("slacks", 0)), Cutting(body)
     shins = garment.vertices[garment.vertices[:, 1] < cutting.height(1)]
     assert 0.003 < np.abs(shins[:, 0]).min() < 0.03 and np.ptp(shins[shins[:, 0] > 0, 0]) > 0.18
 

@@ -10,8 +10,15 @@ from scipy.spatial.transform import Rotation
 from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
-from avatar.simulate.angles import CENTRAL, LIMITS, pose_from_angles
-from avatar.simulate.everyday import EVERYDAY, everyday_angles
+from avatar.simulate.angles import (
+    CENTRAL,
+    EVERYDAY,
+    LIMITS,
+    SEQUENCES,
+    authored_motion,
+    everyday_angles,
+    pose_from_angles,
+)
 from avatar.simulate.poses import (
     APART,
     KINDS,
@@ -22,7 +29,6 @@ from avatar.simulate.poses import (
     random_angles,
     split_distances,
 )
-from avatar.simulate.sequences import SEQUENCES, authored_motion
 
 
 @cache
@@ -63,7 +69,7 @@ def test_named_angles_move_what_they_name():
 
 def test_angles_are_held_within_limits():
     wild = {name if name in CENTRAL else f"left_{name}": 1000.0 for name in LIMITS}
-    held = {key: LIMITS[key.removeprefix("left_")][1] for key in wild}
+    held = {key: LIMITS[key.removeprefix("left_")][2] for key in wild}
     np.testing.assert_array_equal(pose_from_angles(wild, 1), pose_from_angles(held, 1))
     with pytest.raises(AvatarError, match="got left_kne"):
         pose_from_angles({"left_kne": 3}, 1)
@@ -82,7 +88,7 @@ def test_the_same_seed_gives_the_same_poses_and_another_gives_others():
 def test_random_poses_cover_every_degree_of_freedom():
     angles = random_angles(64, 0)
     for key, values in angles.items():
-        low, high = LIMITS[key.removeprefix("left_").removeprefix("right_")]
+        low, _, high = LIMITS[key.removeprefix("left_").removeprefix("right_")]
         assert np.ptp(np.clip(values, low, high)) > 0.4 * (high - low), key
     flexion = angles["left_hip_flexion"]
     assert np.corrcoef(flexion, angles["left_knee_flexion"])[0, 1] > 0.2
@@ -172,6 +178,10 @@ def test_poses_that_touch_themselves_are_found():
         (lambda: draw_poses(10_000, 0, "test"), "count: expected at most"),
         (lambda: authored_motion("fly"), "name: expected one of walk"),
         (lambda: authored_motion("walk", 30, 0), "at least one frame"),
+        (lambda: authored_motion("walk", 1e9), r"fps: expected 1 to 1000 frames per second, got 1000000000\.0"),
+        (lambda: authored_motion("walk", float("nan")), "fps: expected 1 to 1000 frames per second, got nan"),
+        (lambda: authored_motion("walk", 30, 1e9), r"seconds: expected 0 to 3600, got 1000000000\.0"),
+        (lambda: authored_motion("walk", 30, float("nan")), "seconds: expected 0 to 3600, got nan"),
     ],
 )
 def test_bad_requests_are_refused(call, message):

@@ -6,7 +6,7 @@ import trimesh
 
 from avatar.checks import AvatarError
 from avatar.simulate.outfits import FabricConfig
-from avatar.simulate.solver import ClothSolver, Collider, SolverConfig
+from avatar.simulate.solver import ClothSolver, SolverConfig
 
 pytest.importorskip("newton")
 pytestmark = pytest.mark.slow
@@ -32,7 +32,7 @@ def ball():
 def drape(steps: int) -> ClothSolver:
     vertices, faces = square(0.108)
     points, ball_faces = ball()
-    solver = ClothSolver(vertices, faces, FabricConfig(), Collider(points, ball_faces), np.zeros(len(vertices)))
+    solver = ClothSolver(vertices, faces, FabricConfig(), points, ball_faces, np.zeros(len(vertices)))
     solver.reset(vertices, points)
     for step in range(steps):
         solver.step(points, vertices, float(np.clip(2 - 2 * step / steps, 0.1, 1)))
@@ -43,7 +43,7 @@ def test_anchors_carry_the_weight_as_springs_do():
     vertices, faces = square(1.0)
     points, ball_faces = ball()
     stiffness = np.full(len(vertices), 0.05)
-    solver = ClothSolver(vertices, faces, FabricConfig(), Collider(points, ball_faces), stiffness)
+    solver = ClothSolver(vertices, faces, FabricConfig(), points, ball_faces, stiffness)
     solver.reset(vertices, points)
     for _ in range(120):
         solver.step(points, vertices)
@@ -72,5 +72,5 @@ def test_bad_settings_are_refused():
     with pytest.raises(AvatarError, match="momentum"):
         SolverConfig(momentum=-0.1)
     vertices, faces = square(1.0)
-    with pytest.raises(AvatarError, match="anchor_stiffness"):
-        ClothSolver(vertices, faces, FabricConfig(), Collider(*ball()), np.zeros(3))
+    with pytest.raises(AvatarError, match="stiffness"):
+        ClothSolver(vertices, faces, FabricConfig(), *ball(), np.zeros(3))

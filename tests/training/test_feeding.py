@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from avatar.training import feeding
-from avatar.training.feeding import Feed
+from avatar.training import trainer
+from avatar.training.trainer import Feed
 
 CPU = torch.device("cpu")
 
@@ -28,7 +28,7 @@ def numbers(step: int) -> tuple[Numbers, Numbers]:
 @pytest.fixture
 def elsewhere(monkeypatch) -> torch.device:
     """A device that is not the CPU, whose tensors stay where they are."""
-    monkeypatch.setattr(feeding, "to_device", lambda records, device: records)
+    monkeypatch.setattr(trainer, "to_device", lambda records, device: records)
     return torch.device("meta")
 
 
@@ -44,6 +44,16 @@ def test_inputs_are_those_of_their_step_wherever_one_begins(elsewhere):
                     assert torch.equal(mine.values, expected.values) and mine.name == expected.name
     with Feed(numbers, 8, elsewhere) as feed:  # and where one jumps
         assert [feed(step)[1].values.item() for step in (3, 3, 0, 7)] == [3, 3, 0, 7]
+
+
+def test_for_cuda_tensors_of_the_cpu_are_pinned_and_those_on_the_device_are_not(monkeypatch):
+    pinned = []
+    monkeypatch.setattr(Tensor, "pin_memory", lambda tensor: pinned.append(tensor) or tensor)
+    mine, there = torch.zeros(3), torch.zeros(3, device="meta")  # torch refuses to pin the second
+    feed = Feed(lambda step: (Numbers(mine, "mine"), Numbers(there, "there")), 2, CPU)
+    feed.pinned = True
+    first, second = feed._prepare(0)
+    assert len(pinned) == 1 and pinned[0] is mine and (first.values is mine, second.values is there) == (True, True)
 
 
 def test_on_the_cpu_no_thread_is_begun():

@@ -4,6 +4,7 @@ import errno
 import math
 import os
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +13,13 @@ import torch
 from spheres import TEMPLATE, random_batch, small_config
 
 from avatar.checks import AvatarError, DataError
-from avatar.io import npz
 from avatar.io.checkpoints import load_checkpoint
 from avatar.io.locks import HELD, lock_folder
 from avatar.methods import points
 from avatar.methods.closet import ClosetAvatar
 from avatar.methods.losses import TERMS, LossConfig, point_avatar_loss
 from avatar.methods.points import PointTask
-from avatar.methods.settings import Schedule, TrainConfig
+from avatar.methods.settings import Clock, Schedule, TrainConfig
 from avatar.training.logs import read_log
 from avatar.training.signals import Stopped
 from avatar.training.trainer import Trainer
@@ -111,13 +111,13 @@ def test_a_full_disk_ends_training_with_the_last_checkpoint_sound(tmp_path, monk
     fit(make_trainer(tmp_path, steps=3))
     rows = (tmp_path / "metrics.csv").read_text()
 
-    def full(path, data):
-        if path.suffix == refused[-1]:
+    def full(part, target):
+        if target.suffix == refused[-1]:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(path, data)
+        return replace_file(part, target)
 
-    write, refused = npz._replace, []
-    monkeypatch.setattr(npz, "_replace", full)
+    replace_file, refused = Path.replace, []
+    monkeypatch.setattr(Path, "replace", full)
     for kind in (".pt", ".json", ".csv"):
         refused.append(kind)
         with pytest.raises(DataError, match="No space left"):
@@ -168,6 +168,23 @@ def test_clock_ends_training_and_drives_progress(tmp_path):
     assert trainer.progress() == pytest.approx(0.5)  # of 0.6 seconds
     trainer.step = 70_000
     assert trainer.progress() == pytest.approx(0.7)
+
+
+def test_processor_time_does_not_pass_while_others_work(tmp_path):
+    def spent(clock):
+        started = clock.seconds()
+        time.sleep(0.2)
+        return clock.seconds() - started
+
+    assert spent(Clock.processor) < 0.1 < 0.2 <= spent(Clock.wall)
+    trainer = make_trainer(tmp_path, steps=100_000, minutes=0.01, clock=Clock.processor)
+    used = Clock.processor.seconds()
+    fit(trainer)
+    assert 0.6 <= trainer.seconds <= Clock.processor.seconds() - used
+    trainer.model.to("meta")  # another device, whose work processor time leaves out
+    with pytest.raises(AvatarError, match=r"train\.clock: .* leaves out the work of meta\. Hint: train\.clock=wall"):
+        Trainer(trainer.task, trainer.budget, tmp_path)
+    Trainer(trainer.task, replace(trainer.budget, clock=Clock.wall), tmp_path)
 
 
 def test_rates_follow_their_schedule(tmp_path):

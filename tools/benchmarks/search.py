@@ -11,8 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avatar.geometry.distances import normal_difference, point_to_point
-from avatar.geometry.neighbours import correspond, nearest
+from avatar.geometry.neighbours import correspond, nearest, normal_difference, point_to_point
 from avatar.geometry.sparse import gather_rows
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from benchmarks.avatars import sample_outfit

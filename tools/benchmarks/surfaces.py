@@ -11,19 +11,17 @@ import torch
 from torch import Tensor
 
 from avatar.canonical.canonicalizer import Canonicalizer, CanonicalizerConfig
-from avatar.canonical.posed import prepare_scan
+from avatar.canonical.scans import prepare_scan
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
 from avatar.implicit.networks import PosedSdf, SdfConfig
 from avatar.methods.canonicalizer import CanonicalizerTask, CycleConfig
 from avatar.records import Mesh, PointCloud
 from avatar.settings import settings_from_dict
-from avatar.simulate.dressing import TravelConfig
+from avatar.simulate.dressing import DressedBody, TravelConfig
 from avatar.simulate.outfits import outfit
 from avatar.simulate.poses import draw_poses
-from avatar.simulate.production import dress
-from avatar.training.feeding import to_device
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import Trainer, to_device
 from benchmarks.avatars import sample_outfit
 from benchmarks.comparisons import Comparison, Job, Run, absence
 
@@ -66,7 +64,7 @@ def extraction_comparisons(job: Job) -> list[Comparison]:
         def field(points: Tensor) -> Tensor:
             return sdf(points[None], points.new_zeros(1, len(points), 0))[0]
 
-        return lambda: extract_surface(field, box, config).mesh
+        return lambda: extract_surface(field, box, config)
 
     def gap(mine: Mesh, baseline: Mesh) -> float:
         same = mine.vertices.shape == baseline.vertices.shape
@@ -104,7 +102,7 @@ def simulation_comparisons(job: Job) -> list[Comparison]:
     travel = TravelConfig(stride=0.3, hold=3, least_hold=1) if job.quick else TravelConfig()
 
     def prepare(name: str) -> Run:
-        dressed = dress(outfit(name), travel)
+        dressed = DressedBody(outfit(name), travel)
         pose = draw_poses(1, 0, "train")[0].pose
         return lambda: dressed.settle(pose).cloth
 

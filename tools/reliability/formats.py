@@ -20,10 +20,9 @@ import yaml
 from avatar.body.packed import packed_body
 from avatar.body.smpl import convert_body_model, joint_tree, smpl_body
 from avatar.io.bvh import read_bvh
-from avatar.io.canonical_scans import read_canonical_scan, write_canonical_scan
 from avatar.io.checkpoints import load_checkpoint, read_weights, save_checkpoint, write_weights
 from avatar.io.documents import read_yaml
-from avatar.io.frames import read_open_frame, read_open_garment
+from avatar.io.frames import read_canonical_scan, read_open_frame, read_open_garment, write_canonical_scan
 from avatar.io.meshes import read_mesh, write_mesh
 from avatar.io.motions import read_motion, write_motion
 from avatar.io.points import read_points, write_points
@@ -176,7 +175,7 @@ def copied(*parts: str) -> Callable[[Path], Path]:
     """Makes a copy of a file of the embedded sample, or of the program's assets."""
 
     def make(folder: Path) -> Path:
-        from avatar.data.outfits import SAMPLE_FOLDER
+        from avatar.data.folders import SAMPLE_FOLDER
 
         source = SAMPLE_FOLDER.joinpath(*parts)
         source = sorted(source.glob("*.npz"))[0] if source.is_dir() else source

@@ -48,7 +48,7 @@ def disk_trial(root: Path, points: int, seed: int) -> list[Finding]:
                 (place / "filler").unlink()
             else:
                 outcome = run_worker(train_in_small_files, job, place, name, free)
-            reported += outcome.code == 2 and str(folder) in outcome.error and "Make room" in outcome.error
+            reported += outcome.code == 2 and str(folder) in outcome.error and "Free disk space" in outcome.error
             kept += before is not None and digest(load_quietly(folder / "checkpoints")) == before
             run_worker(train_job, job, place, name)
             equal += weights_digest(folder) == expected[job]

@@ -20,7 +20,7 @@ from avatar.io.checkpoints import load_checkpoint
 from avatar.io.frames import check_manifest
 from avatar.io.ledger import digest_of
 from avatar.methods.settings import FitConfig, RunConfig
-from avatar.pipeline.comparison import CompareConfig
+from avatar.pipeline.reporting import CompareConfig
 from avatar.pipeline.scores import PredictConfig, predict
 from avatar.pipeline.surfaces import ExportConfig, MeshConfig, mesh
 from avatar.runs.training import save_settings

@@ -11,8 +11,8 @@ import torch
 
 from avatar.canonical.canonicalizer import CanonicalizerConfig
 from avatar.canonical.fields import SkinningFieldConfig
-from avatar.canonical.posed import DrawConfig
-from avatar.data.outfits import SAMPLE_FOLDER
+from avatar.canonical.scans import DrawConfig
+from avatar.data.folders import SAMPLE_FOLDER
 from avatar.data.scanner import ScanConfig
 from avatar.data.splits import SplitConfig
 from avatar.io.frames import write_manifest
@@ -43,7 +43,7 @@ POP = {
 }
 SCANIMATE = {
     "avatar": {"sdf": {"widths": [16, 16, 16], "skip": 1, "orders": 2}, "gate_spacing": 0.1},
-    "train": {"probes": {"near_points": 60, "box_points": 30, "rim_points": 20}},
+    "train": {"queries": {"near_points": 60, "box_points": 30, "boundary_points": 20}},
 }
 SETTINGS: dict[str, dict[str, Any]] = {"closet": CLOSET, "pop": POP, "scanimate": SCANIMATE}
 JOBS = ("closet", "pop", "canonicalizer", "scanimate")

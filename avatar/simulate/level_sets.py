@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
+import trimesh
 from scipy.ndimage import map_coordinates
 
 SNAP = 0.4  # vertices nearer to a cut than this share of their edge move onto it, so no sliver is cut off
@@ -36,40 +37,28 @@ class Grid:
 
 
 def surface_nets(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """The zero level of a field as triangles, wound so that normals point to positive values.
+    """The zero level of a field as vertices ``(V, 3)`` in metres and triangles ``(F, 3)`` facing positive values.
 
     Naive surface nets (Gibson 1998): one vertex a cell at the mean of its edge crossings, one quad an edge.
-
-    Returns:
-        ``(V, 3)`` vertices in metres and ``(F, 3)`` faces.
     """
-    values = grid.values
-    shape = np.array(values.shape)
-    sums, counts = np.zeros((*(shape - 1), 3)), np.zeros(shape - 1)
-    quads = []
-    cell_ids = np.arange(np.prod(shape - 1)).reshape(shape - 1)
+    shape = np.array(grid.values.shape)
+    sums, counts, quads = np.zeros((np.prod(shape - 1), 3)), np.zeros((np.prod(shape - 1), 1)), []
     for axis in range(3):
-        first = np.moveaxis(values, axis, 0)
-        low, high = np.moveaxis(first[:-1], 0, axis), np.moveaxis(first[1:], 0, axis)
+        u, v, along = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3, axis]]
+        low, high = (np.moveaxis(np.moveaxis(grid.values, axis, 0)[part], 0, axis) for part in (np.s_[:-1], np.s_[1:]))
         at = np.argwhere((low < 0) != (high < 0))
-        inner = np.all([(at[:, a] > 0) & (at[:, a] < shape[a] - 1) for a in range(3) if a != axis], axis=0)
-        at = at[inner]
+        at = at[(((at > 0) & (at < shape - 1)) | (along > 0)).all(axis=1)]
         a, b = low[tuple(at.T)], high[tuple(at.T)]
-        crossing = at.astype(float)
-        crossing[:, axis] += a / (a - b)
-        u, v = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
-        around = [at - u - v, at - v, at, at - u]
+        crossing = at + along * (a / (a - b))[:, None]
+        around = [np.ravel_multi_index(cell.T, shape - 1) for cell in (at - u - v, at - v, at, at - u)]
         for cell in around:
-            np.add.at(sums, tuple(cell.T), crossing)
-            np.add.at(counts, tuple(cell.T), 1)
-        quad = np.stack([cell_ids[tuple(cell.T)] for cell in around], -1)
+            np.add.at(sums, cell, crossing)
+            np.add.at(counts, cell, 1)
+        quad = np.stack(around, -1)
         quads.append(np.where((a < 0)[:, None], quad, quad[:, ::-1]))
-    quads = np.concatenate(quads)
-    used, quads = np.unique(quads, return_inverse=True)
-    quads = quads.reshape(-1, 4)
-    vertices = sums.reshape(-1, 3)[used] / counts.reshape(-1, 1)[used]
-    vertices = vertices * grid.step + grid.origin
-    return vertices, split_quads(vertices, quads)
+    used, quads = np.unique(np.concatenate(quads), return_inverse=True)
+    vertices = sums[used] / counts[used] * grid.step + grid.origin
+    return vertices, split_quads(vertices, quads.reshape(-1, 4))
 
 
 def split_quads(vertices: np.ndarray, quads: np.ndarray) -> np.ndarray:
@@ -83,18 +72,18 @@ def split_quads(vertices: np.ndarray, quads: np.ndarray) -> np.ndarray:
 
 def mesh_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Undirected edges ``(E, 2)`` and how many faces have each ``(E,)``."""
-    return np.unique(
-        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1), axis=0, return_counts=True
-    )
+    return np.unique(face_sides(faces), axis=0, return_counts=True)
+
+
+def face_sides(faces: np.ndarray) -> np.ndarray:
+    """The sides of faces, smaller index first: ``(3 F, 2)``, the first three of the first face."""
+    return np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
 
 
 def clip(vertices: np.ndarray, faces: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of a mesh where a per-vertex value is negative, cut along its zero level.
+    """The part of a mesh where a value ``(V,)`` of its vertices is negative, cut along its zero level.
 
     Vertices near the cut move onto it first, so that no sliver is left along the new boundary.
-
-    Args:
-        vertices: ``(V, 3)``; faces: ``(F, 3)``; signed: ``(V,)`` the value, negative where the mesh stays.
     """
     vertices, signed = vertices.copy(), signed.astype(float).copy()
     edges, _ = mesh_edges(faces)
@@ -106,8 +95,8 @@ def clip(vertices: np.ndarray, faces: np.ndarray, signed: np.ndarray) -> tuple[n
     nearest = order[first]
     near = share[nearest] < SNAP
     movers, nearest = movers[near], nearest[near]
-    moved = vertices[movers] + share[nearest, None] * (vertices[both[nearest, 1]] - vertices[movers])
-    vertices[movers], signed[movers] = moved, 0.0
+    vertices[movers] += share[nearest, None] * (vertices[both[nearest, 1]] - vertices[movers])
+    signed[movers] = 0.0
 
     sides = np.sign(signed)[faces]
     keep = faces[(sides <= 0).all(1) & (sides < 0).any(1)]
@@ -130,8 +119,8 @@ def clip(vertices: np.ndarray, faces: np.ndarray, signed: np.ndarray) -> tuple[n
             if signed[i] * signed[j] < 0:
                 polygon.append(middle(int(i), int(j)))
         new_faces += [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]
-    everything = np.concatenate([vertices, np.array(points).reshape(-1, 3)])
-    return compact(everything, np.concatenate([keep, np.array(new_faces, dtype=int).reshape(-1, 3)]))
+    faces = np.concatenate([keep, np.array(new_faces, dtype=int).reshape(-1, 3)])
+    return compact(np.concatenate([vertices, np.array(points).reshape(-1, 3)]), faces)
 
 
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,20 +131,15 @@ def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def largest_component(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The connected piece of a mesh with most vertices."""
-    edges, _ = mesh_edges(faces)
-    graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
-    _, labels = sparse.csgraph.connected_components(graph, directed=False)
+    labels = trimesh.graph.connected_component_labels(mesh_edges(faces)[0], len(vertices))
     return compact(vertices, faces[labels[faces[:, 0]] == np.bincount(labels).argmax()])
 
 
 def drop_ears(faces: np.ndarray) -> np.ndarray:
     """Faces without those that hang on the mesh by a single edge or a single corner."""
     while True:
-        edges, counts = mesh_edges(faces)
-        sides = np.sort(np.stack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]], 1), axis=2)
-        base = edges.max() + 1
-        found = np.searchsorted(edges[:, 0] * base + edges[:, 1], sides[..., 0] * base + sides[..., 1])
-        ears = (counts[found] == 1).sum(1) >= 2
+        _, ids, counts = np.unique(face_sides(faces), axis=0, return_inverse=True, return_counts=True)
+        ears = (counts[ids].reshape(-1, 3) == 1).sum(1) >= 2
         if not ears.any():
             return faces
         faces = faces[~ears]
@@ -167,8 +151,7 @@ def collapse_short_edges(vertices: np.ndarray, faces: np.ndarray, shortest: floa
     while True:
         edges, counts = mesh_edges(faces)
         lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-        rim = np.zeros(len(vertices), bool)
-        rim[edges[counts == 1]] = True
+        rim = np.isin(np.arange(len(vertices)), edges[counts == 1])
         bridge = (counts > 1) & rim[edges].all(axis=1)  # merging these would pinch the rim
         short = np.flatnonzero((lengths < shortest) & ~bridge)
         if not len(short):
@@ -224,17 +207,11 @@ def flip_edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def smoothing_matrix(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Row-stochastic neighbour averages, where boundary vertices average along the boundary only.
-
-    Returns:
-        ``(V, V)`` matrix and the ``(V,)`` boundary mask.
-    """
+    """Neighbour averages ``(V, V)``, of boundary vertices along the boundary only, and the boundary's mask ``(V,)``."""
     edges, counts = mesh_edges(faces)
-    rim = np.zeros(count, bool)
-    rim[edges[counts == 1]] = True
+    rim = np.isin(np.arange(count), edges[counts == 1])
     pairs = np.concatenate([edges, edges[:, ::-1]])
-    border = np.concatenate([counts == 1, counts == 1])
-    pairs = pairs[~rim[pairs[:, 0]] | border]
+    pairs = pairs[~rim[pairs[:, 0]] | np.tile(counts == 1, 2)]
     matrix = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count)).tocsr()
     return sparse.diags(1 / np.maximum(matrix.sum(1).A1, 1)) @ matrix, rim
 
@@ -243,6 +220,5 @@ def relax(vertices: np.ndarray, faces: np.ndarray, grid: Grid, rounds: int = 15)
     """Evens out triangles by averaging neighbours and going back to the level set after each round."""
     average, rim = smoothing_matrix(faces, len(vertices))
     for _ in range(rounds):
-        moved = vertices + np.where(rim, 0.3, 0.5)[:, None] * (average @ vertices - vertices)
-        vertices = grid.project(moved)
+        vertices = grid.project(vertices + np.where(rim, 0.3, 0.5)[:, None] * (average @ vertices - vertices))
     return vertices

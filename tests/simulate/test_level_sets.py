@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from avatar.simulate.implicit import (
+from avatar.simulate.level_sets import (
     Grid,
     clip,
     collapse_short_edges,
