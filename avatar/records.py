@@ -177,6 +177,7 @@ class Prediction:
     wrinkle_offsets: Tensor | None = None  # (B, N, 3) r^p of CloSET eq. 3
     wrinkle_normals: Tensor | None = None  # (B, N, 3) added by the pose to the garment's, before they are normalised
     codes: Tensor | None = None  # (B, ..., C) garment codes used
+    mesh: Tensor | None = None  # (B, V, 3) vertices of a surface of constant topology, where points lie on one
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from avatar.body.skinning import skin_transforms
 from avatar.canonical.clothed_weights import diffuse_weights, inpaint_weights, tidy_weights
-from avatar.canonical.scans import local_pose
 from avatar.canonical.refinement import PosedPoints, RefineConfig, chamfer, refine
+from avatar.canonical.scans import local_pose
 from avatar.canonical.skin import SkinVote, body_offsets, label_points, vote_skin
 from avatar.canonical.winding import Winding, area_vectors, grid_around
 from avatar.checks import AvatarError, check_shape

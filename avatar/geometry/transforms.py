@@ -73,6 +73,18 @@ def invert_affine(transforms: Tensor) -> Tensor:
     return assemble_transform(inverse_linear, -(inverse_linear @ transforms[..., :3, 3:]).squeeze(-1))
 
 
+def tilt_rotations(rotations: Tensor) -> Tensor:
+    """What is left of rotations ``(..., 3, 3)`` when the nearest rotation about the vertical (y) is taken away first.
+
+    R = Y tilt, with Y the rotation about y that differs least from R. Upside down, where all are as near, Y is 0.
+    """
+    sine, cosine = rotations[..., 0, 2] - rotations[..., 2, 0], rotations[..., 0, 0] + rotations[..., 2, 2]
+    yaw = torch.atan2(sine, cosine)
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    rows = [yaw.cos(), zero, -yaw.sin(), zero, one, zero, yaw.sin(), zero, yaw.cos()]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3)) @ rotations
+
+
 def rotation_between(source: Tensor, target: Tensor) -> Tensor:
     """The smallest rotation that turns one direction ``(3,)`` onto another, ``(3, 3)``; worked out in float64.
 

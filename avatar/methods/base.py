@@ -17,6 +17,7 @@ from avatar.records import Batch, BodyFit, LossTerms, PointCloud, SurfaceSamples
 Inputs = tuple[Any, ...]  # dataclasses of tensors; the first has the ``names`` of its frames
 SEED_STRIDE = 1_000_003  # between the seeds of a run's ranks and tasks, so that a step's draw is that of no other run
 CANONICALIZER = "canonicalizer"  # a method's need: a trained canonicalizer for each outfit
+CLOTHED_TEMPLATE = "clothed template"  # a need: the template of each outfit, in its canonicalizer's run
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class Method(ABC):
         """Raises `AvatarError`, before data are read, for a run that the method cannot train."""
 
     def needs(self, run: RunConfig, settings: Any) -> frozenset[str]:
-        """What must be made of the outfits before training: any of {`CANONICALIZER`}."""
+        """What must be made of the outfits before training: any of {`CANONICALIZER`, `CLOTHED_TEMPLATE`}."""
         return frozenset()
 
     @abstractmethod

@@ -21,7 +21,7 @@ from avatar.methods.base import CANONICALIZER, TrainedAvatar
 from avatar.methods.canonicalizer import canonicalizer_folder, load_canonicalizer
 from avatar.methods.points import PointMethod
 from avatar.methods.settings import FitConfig, RunConfig
-from avatar.nn.decoders import Decoded, DecoderConfig, Normals, ShapeDecoder, TemplateNetwork
+from avatar.nn.decoders import Decoded, DecoderConfig, Normals, PoseFrame, ShapeDecoder, TemplateNetwork
 from avatar.nn.encoders import ENCODERS, Encoder, PointNet2Config
 from avatar.nn.locality import LocalPoseConfig, LocalPoseEncoder
 from avatar.nn.posing import LearnedSkinning
@@ -67,6 +67,7 @@ class ClosetConfig:
     pose_noise: float = 0.0  # metres; noise on the pose encoder's input in training
     relative: bool = True  # the pose encoder's first abstraction sees how features differ from a group's centre as well
     rest_vertices: bool = True  # the pose encoder sees the template's vertices as features beside the posed ones
+    pose_frame: PoseFrame = PoseFrame.root  # axes of what the pose encoder sees; heading is ours
     pose_locality: PoseLocality = PoseLocality.whole
     local_encoder: LocalPoseConfig = field(default_factory=LocalPoseConfig)  # instead of pose_encoder when kinematic
     skinning: Skinning = Skinning.body
@@ -146,7 +147,7 @@ class ClosetAvatar(TemplateNetwork):
         """Features ``(B, N, C)`` of each sample, of its frame's whole pose or of the joints near it."""
         if self.config.pose_locality is PoseLocality.kinematic:
             return self.pose_encoder(batch.joint_transforms, samples)
-        pose_vertices = batch.pose_vertices
+        pose_vertices = self.pose_input(batch)
         if self.training and self.config.pose_noise:
             pose_vertices = pose_vertices + torch.randn_like(pose_vertices) * self.config.pose_noise
         if self.config.rest_vertices:

@@ -25,7 +25,17 @@ from avatar.methods.canonicalizer import canonical_outfits
 from avatar.methods.losses import TERMS, point_avatar_loss
 from avatar.methods.settings import FitConfig, Precision, RunConfig, Space, TrainConfig
 from avatar.progress import tracked
-from avatar.records import Batch, BodyFit, LossTerms, PointCloud, Prediction, Surface, SurfaceSamples, Template
+from avatar.records import (
+    Batch,
+    BodyFit,
+    LossTerms,
+    PointCloud,
+    Prediction,
+    Surface,
+    SurfaceSamples,
+    Template,
+    map_tensors,
+)
 from avatar.world import current_world, step_outfits
 
 MAX_POINTS = 400_000
@@ -51,7 +61,7 @@ def draw_samples(model: nn.Module, template: Template, points: int, generator: t
 class PointTask(Task):
     """Training of a point method: batches, template points and the losses of a prediction, in its precision."""
 
-    terms = ("chamfer", *TERMS)
+    terms: tuple[str, ...] = ("chamfer", *TERMS)
     criterion = "chamfer"
 
     def __init__(
@@ -106,12 +116,16 @@ class PointTask(Task):
         with torch.autocast(self.device.type, torch.bfloat16) if narrow else nullcontext():
             prediction = self.model(batch, samples)
         if prediction.points.device.type != "cpu" or torch.isfinite(prediction.points).all():
-            return point_avatar_loss(prediction, batch, self.config.loss, position.progress)
+            return self.objective(prediction, batch, position.progress)
         # as on devices, where neighbours of NaN are not refused; by the graph of all processes, which wait for it
-        defined = replace(prediction, points=prediction.points.nan_to_num(0.0, 0.0, 0.0))
-        terms = point_avatar_loss(defined, batch, self.config.loss, position.progress)
+        defined = map_tensors(prediction, lambda values: values.nan_to_num(0.0, 0.0, 0.0))
+        terms = self.objective(defined, batch, position.progress)
         undefined = {name: value * math.nan for name, value in terms.weighted.items()}
         return LossTerms(dict.fromkeys(terms.raw, torch.tensor(math.nan)), undefined)
+
+    def objective(self, prediction: Prediction, batch: Batch, progress: float) -> LossTerms:
+        """The loss terms of a prediction."""
+        return point_avatar_loss(prediction, batch, self.config.loss, progress)
 
     def log_values(self, terms: LossTerms) -> dict[str, float]:
         values = super().log_values(terms)
@@ -125,6 +139,7 @@ class PointMethod(Method):
     """Base of the point methods: a ``network`` class, built as ``network(template, outfits, settings)``."""
 
     network: ClassVar[type[nn.Module]]
+    task: ClassVar[type[PointTask]] = PointTask
     on_body = True
 
     def needs(self, run: RunConfig, settings: Any) -> frozenset[str]:
@@ -161,7 +176,7 @@ class PointMethod(Method):
 
         torch.manual_seed(train.seed)
         model = self.build(run, settings, template, outfits).to(choose_device(run.device))
-        return PointTask(model, template, train, batch_at, len(frames), validation)
+        return self.task(model, template, train, batch_at, len(frames), validation)
 
     def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
         return self.network(template, outfits, settings)

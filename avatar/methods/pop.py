@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from avatar.checks import AvatarError
 from avatar.methods.points import PointMethod
 from avatar.nn.atlas import Atlas
-from avatar.nn.decoders import DecoderConfig, Normals, ShapeDecoder, TemplateNetwork
+from avatar.nn.decoders import DecoderConfig, Normals, PoseFrame, ShapeDecoder, TemplateNetwork
 from avatar.nn.unet import UNet, UNetConfig
 from avatar.records import Batch, SurfaceSamples, Template
 
@@ -39,6 +39,7 @@ class PopConfig:
     offset_scale: float = 0.02  # metres one unit of a decoder's output stands for
     template: bool = False  # CloSET's explicit template decomposition on POP's features (its table 5, POP + ETD)
     points: PointSource = PointSource.grid
+    pose_frame: PoseFrame = PoseFrame.root  # axes of what the pose encoder sees; heading is ours
     normals: Normals = Normals.body  # what decoded normals start from; free as in the paper
 
     def __post_init__(self):
@@ -84,7 +85,7 @@ class PopAvatar(TemplateNetwork):
 
     def pose_features(self, batch: Batch, samples: SurfaceSamples) -> Tensor:
         """Features ``(B, N, C)`` of each sample in the map of its frame's pose."""
-        return self.atlas.look_up_at(samples)(self.pose_encoder(self.atlas.position_map(batch.pose_vertices)))
+        return self.atlas.look_up_at(samples)(self.pose_encoder(self.atlas.position_map(self.pose_input(batch))))
 
     def places(self, samples: SurfaceSamples) -> Tensor:
         """UV and patch coordinates of each point, ``(N, 4)``."""

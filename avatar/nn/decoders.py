@@ -13,7 +13,7 @@ from torch.nn.functional import linear, normalize
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.sparse import pick
 from avatar.geometry.surface import interpolate, interpolate_transforms, vertex_normals
-from avatar.geometry.transforms import transform_directions
+from avatar.geometry.transforms import tilt_rotations, transform_directions
 from avatar.nn.layers import WideLinear, point_mlp, wide_linear
 from avatar.records import Batch, Prediction, SurfaceSamples, Template
 
@@ -29,6 +29,13 @@ class DecoderConfig:
     def __post_init__(self):
         if self.width < 1 or self.trunk < 1 or self.branch < 0:
             raise AvatarError(f"width, trunk, branch: expected positive sizes, got {vars(self)}.")
+
+
+class PoseFrame(Enum):
+    """Axes in which a pose encoder sees the posed body."""
+
+    root = "root"  # the pelvis's: whether the person stands, leans or lies is not seen
+    heading = "heading"  # the pelvis's with its tilt: rotation about the vertical and place alone are removed
 
 
 class Normals(Enum):
@@ -56,15 +63,19 @@ class Decoded:
 class ShapeDecoder(nn.Module):
     """The decoder POP, SCALE and CloSET share: a trunk, the input joined again, then an offset and a normal branch."""
 
-    def __init__(self, channels: int, config: DecoderConfig):
-        """Builds the decoder for ``channels`` features and coordinates of a place together."""
+    def __init__(self, channels: int, config: DecoderConfig, normals: bool = True):
+        """Builds the decoder for ``channels`` features and coordinates of a place together; decoded normals are zero
+        without ``normals``.
+        """
         super().__init__()
         width = config.width
         self.trunk = point_mlp((channels,) + (width,) * config.trunk, activation=nn.Softplus)
         self.join = point_mlp((channels + width, width), activation=nn.Softplus)
         hidden = (width,) * (config.branch + 1)
         self.offset_branch = nn.Sequential(*point_mlp(hidden, activation=nn.Softplus), WideLinear(width, 3))
-        self.normal_branch = nn.Sequential(*point_mlp(hidden, activation=nn.Softplus), WideLinear(width, 3))
+        self.normal_branch: nn.Module | None = None
+        if normals:
+            self.normal_branch = nn.Sequential(*point_mlp(hidden, activation=nn.Softplus), WideLinear(width, 3))
 
     def forward(self, features: Tensor, places: Tensor) -> Decoded:
         """``(B, N, C)`` features and ``(N, P)`` places of points to offsets and normals ``(B, N, 3)``.
@@ -73,7 +84,8 @@ class ShapeDecoder(nn.Module):
         """
         hidden = apply_joined(self.trunk, features, places)
         joined = apply_joined(self.join, features, places, hidden)
-        return Decoded(self.offset_branch(joined), self.normal_branch(joined))
+        offsets = self.offset_branch(joined)
+        return Decoded(offsets, self.normal_branch(joined) if self.normal_branch else torch.zeros_like(offsets))
 
 
 def apply_joined(layers: nn.Sequential, features: Tensor, places: Tensor, *others: Tensor) -> Tensor:
@@ -105,7 +117,15 @@ class TemplateNetwork(nn.Module):
         self.config = config
         self.pose_decoder: ShapeDecoder | None = None
         self.register_buffer("vertices", template.vertices.clone(), persistent=False)
+        self.register_buffer("pelvis", template.joints[0].clone(), persistent=False)
         self.register_buffer("skin_normals", vertex_normals(template.vertices, template.faces), persistent=False)
+
+    def pose_input(self, batch: Batch) -> Tensor:
+        """The posed body ``(B, V, 3)`` that the pose encoder sees, in the axes of ``config.pose_frame``."""
+        if self.config.pose_frame is PoseFrame.root:
+            return batch.pose_vertices
+        tilt = tilt_rotations(batch.joint_transforms[:, 0, :3, :3])
+        return (batch.pose_vertices - self.pelvis) @ tilt.transpose(-1, -2) + self.pelvis
 
     def places(self, samples: SurfaceSamples) -> Tensor:
         """Coordinates ``(N, P)`` of each sample that the decoders see: its position on the template."""

@@ -1,0 +1,249 @@
+"""Layered avatar: CloSET's network on a clothed template, with the body's own skin and a garment mesh of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from avatar.body.skinning import skin_transforms
+from avatar.checks import AvatarError, DataError, check_range
+from avatar.data.outfits import Outfit
+from avatar.geometry.cloth import ClothMesh, bending, body_contact, edge_strain, self_contact
+from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
+from avatar.geometry.transforms import invert_rigid, transform_points
+from avatar.implicit.extraction import ExtractionConfig
+from avatar.invocation import command_line
+from avatar.io.clothed_templates import read_clothed_template
+from avatar.methods.base import CANONICALIZER, CLOTHED_TEMPLATE, SEED_STRIDE, TrainedAvatar
+from avatar.methods.canonicalizer import canonicalizer_folder
+from avatar.methods.closet import ClosetAvatar, ClosetConfig, Skinning
+from avatar.methods.points import PointMethod, PointTask, body_batch, check_count, join_clouds
+from avatar.methods.settings import FitConfig, RunConfig, Space
+from avatar.records import (
+    Batch,
+    BodyFit,
+    ClothedTemplate,
+    LossTerms,
+    Mesh,
+    PointCloud,
+    Prediction,
+    Surface,
+    SurfaceSamples,
+    Template,
+)
+
+STATE = ("vertices", "faces", "weights", "body_vertex", "covered")  # of the clothed template, saved with the weights
+REST_APART = 0.04  # metres at rest from which on two places of a garment may not touch
+TERMS = ("laplacian", "strain", "bending", "body_contact", "self_contact")
+
+
+class Head(Enum):
+    """What the network decodes on the garment."""
+
+    mesh = "mesh"  # its vertices: points lie on the mesh, and normals are the mesh's
+    points = "points"  # points of their own and their normals, as CloSET does
+
+
+@dataclass
+class ClothConfig:
+    """Weights of what the decoded garment mesh is held to; metres and radians. Zero switches a term off."""
+
+    laplacian: float = 4e4  # mean square of how offsets differ from the mean of their neighbours'
+    strain: float = 1.0  # mean squared strain of edges, against the garment template's
+    bending: float = 0.05  # mean squared change of the angles between faces, against the garment template's
+    body_contact: float = 1e4  # mean square of what vertices lack of the gap to the body
+    self_contact: float = 0.0  # the same between parts of the garment that are apart at rest
+    gap: float = 0.003  # metres, from body to garment and from garment to garment
+
+    def __post_init__(self):
+        check_range(self, *vars(self), low=0)
+
+
+@dataclass
+class LayeredConfig(ClosetConfig):
+    """CloSET's sizes and switches, and those of the garment mesh."""
+
+    code_skip: bool = True  # the decoders see the garment code itself beside its features
+    free_offsets: bool = True  # an offset of each vertex, learned beside the code, is added to the template's
+    head: Head = Head.mesh
+    cloth: ClothConfig = field(default_factory=ClothConfig)
+
+
+class LayeredAvatar(ClosetAvatar):
+    """CloSET's network on the clothed template of one outfit.
+
+    The template is skinned by its own weights, skin vertices are the body's own, and the network moves the garment
+    alone: its vertices (``head=mesh``) or points on it (``head=points``).
+    """
+
+    def __init__(self, template: Template, clothed: ClothedTemplate, config: LayeredConfig):
+        """Builds the network on the body at rest and a clothed template, whose skin vertices come first."""
+        arrays = {name: torch.from_numpy(np.ascontiguousarray(getattr(clothed, name))) for name in STATE}
+        dressed = {name: arrays[name] for name in ("vertices", "faces", "weights")}
+        super().__init__(replace(template, **dressed, uv=None, uv_faces=None), 1, config)
+        for name, value in arrays.items():
+            self.register_buffer(name, value, persistent=True)
+        bind = template.canonical_from_bind
+        self.register_buffer("bind", torch.eye(4).expand(len(template.parents), 4, 4) if bind is None else bind)
+        self.register_buffer("body_faces", template.faces.clone(), persistent=False)
+        self.skin = int((clothed.body_vertex >= 0).sum())  # number of skin vertices
+        self.garment_faces = torch.from_numpy(clothed.faces[clothed.garment_faces] - self.skin)
+        self.shown_faces = torch.from_numpy(np.flatnonzero(clothed.visible_faces))
+        if config.head is Head.mesh:  # normals are those of the mesh
+            for decoder in (getattr(self, "garment_decoder", None), self.pose_decoder):
+                if decoder is not None:
+                    decoder.normal_branch = None
+
+    @property
+    def garment_vertices(self) -> SurfaceSamples:
+        """The garment's vertices as points of the template."""
+        ids = torch.arange(self.skin, len(self.vertices), device=self.vertices.device)
+        corners = torch.eye(3, device=ids.device)[:1].expand(len(ids), 3)
+        return SurfaceSamples(ids[:, None].expand(-1, 3), corners, torch.full_like(ids, -1))
+
+    def draw_samples(self, points: int, generator: torch.Generator) -> SurfaceSamples:
+        """Points spread evenly by area over the template's visible surface."""
+        samples = sample_surface(self.vertices.cpu(), self.faces.cpu()[self.shown_faces], points, generator)
+        return replace(samples, face_ids=self.shown_faces[samples.face_ids])
+
+    @torch.no_grad()
+    def dress(self, batch: Batch) -> Batch:
+        """The batch with the clothed template, posed by its own weights, in place of the body."""
+        transforms = skin_transforms(self.weights, batch.joint_transforms, self.bind)
+        garment = transform_points(transforms[:, self.skin :], self.vertices[self.skin :])
+        vertices = torch.cat([batch.vertices[:, self.body_vertex[: self.skin]], garment], dim=1)
+        root = invert_rigid(batch.joint_transforms[:, :1])
+        seen = transform_points(root, vertices)
+        return replace(batch, vertices=vertices, vertex_transforms=transforms, pose_vertices=seen)
+
+    def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
+        """As `TemplateNetwork.forward`, at points of the clothed template.
+
+        With ``head=mesh`` offsets are those of the garment's vertices, and ``mesh`` has the vertices of skin and
+        garment.
+        """
+        dressed = self.dress(batch)
+        if self.config.head is Head.points:
+            found = super().forward(dressed, samples, wrinkles)
+            garment = (samples.vertex_ids[:, :1] >= self.skin).expand(-1, 3)
+            normals = interpolate(vertex_normals(dressed.vertices, self.faces), samples)
+            return replace(
+                found,
+                points=torch.where(garment, found.points, interpolate(dressed.vertices, samples)),
+                normals=torch.where(garment, found.normals, normalize(normals, dim=-1)),
+            )
+        found = super().forward(dressed, self.garment_vertices, wrinkles)
+        with torch.autocast(found.points.device.type, enabled=False):
+            mesh = torch.cat([dressed.vertices[:, : self.skin], found.points], dim=1)
+            normals = normalize(interpolate(vertex_normals(mesh, self.faces), samples), dim=-1, eps=1e-20)
+            return replace(found, points=interpolate(mesh, samples), normals=normals, wrinkle_normals=None, mesh=mesh)
+
+
+class LayeredTask(PointTask):
+    """Training on points of the clothed template's visible surface, with the terms of its mesh."""
+
+    terms = (*PointTask.terms, *TERMS)
+
+    def __init__(self, model: LayeredAvatar, *rest: Any):
+        super().__init__(model, *rest)
+        self.cloth = ClothMesh.of_faces(model.garment_faces).to(self.device)
+
+    def draw_points(self, key: int) -> SurfaceSamples:
+        generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key)
+        return self.model.draw_samples(self.config.points, generator)
+
+    def objective(self, prediction: Prediction, batch: Batch, progress: float) -> LossTerms:
+        terms, config = super().objective(prediction, batch, progress), self.model.config.cloth
+        if prediction.mesh is None:
+            return terms
+        cloth, skin = self.cloth, self.model.skin
+        garment, flat = prediction.mesh[:, skin:], self.model.vertices[skin:]
+        rest = flat + (prediction.offsets if prediction.garment_offsets is None else prediction.garment_offsets)
+        measures: dict[str, Callable[[], Tensor]] = {
+            "laplacian": lambda: cloth.differences(prediction.offsets).square().sum(dim=-1).mean(),
+            "strain": lambda: edge_strain(cloth.edge_lengths(garment), cloth.edge_lengths(rest)),
+            "bending": lambda: bending(cloth.angles(garment), cloth.angles(rest)),
+            "body_contact": lambda: body_contact(garment, batch.vertices, self.model.body_faces, config.gap),
+            "self_contact": lambda: self_contact(garment, flat, config.gap, REST_APART),
+        }
+        weights = {name: getattr(config, name) for name in TERMS if getattr(config, name)}
+        raw = {name: measures[name]() for name in weights}
+        weighted = {name: value * weights[name] for name, value in raw.items()}
+        return LossTerms(terms.raw | raw, terms.weighted | weighted)
+
+
+class Layered(PointMethod):
+    """The layered avatar of one outfit, on the clothed template that its canonicalizer's run has."""
+
+    name = "layered"
+    Settings = LayeredConfig
+    task = LayeredTask
+    on_body = False
+    makes_meshes = True
+    static: ClassVar[Mapping[str, Any]] = {"pose": False}
+
+    def check(self, run: RunConfig, settings: LayeredConfig) -> None:
+        if len(run.outfit) != 1:
+            raise AvatarError(f"outfit: the layered method has one clothed template, got {len(run.outfit)} outfits.")
+        if run.space is not Space.posed or settings.skinning is not Skinning.body:
+            raise AvatarError("space, skinning: the layered method is posed by its clothed template; leave them out.")
+
+    def needs(self, run: RunConfig, settings: LayeredConfig) -> frozenset[str]:
+        return frozenset({CANONICALIZER, CLOTHED_TEMPLATE})
+
+    def build(self, run: RunConfig, settings: LayeredConfig, template: Template, outfits: list[Outfit]) -> nn.Module:
+        path = canonicalizer_folder(run.runs_root, outfits[0], run.canonical) / "template" / "template.npz"
+        if not path.is_file():
+            where = [f"dataset={run.dataset}", f"outfit={run.outfit[0]}", f"canonical={run.canonical}"]
+            raise DataError(path, "expected a clothed template, there is none.", command_line("template", *where))
+        return LayeredAvatar(template, read_clothed_template(path), settings)
+
+    def untrained(self, settings: LayeredConfig, template: Template) -> nn.Module:
+        arrays = {name: getattr(template, name).numpy() for name in ("vertices", "faces", "weights")}
+        count = len(template.vertices)
+        clothed = ClothedTemplate(**arrays, body_vertex=np.full(count, -1), covered=np.zeros(count, bool))
+        return LayeredAvatar(template, clothed, settings)
+
+    def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
+        return LayeredAvatar(template, ClothedTemplate(**{name: weights[name].numpy() for name in STATE}), settings)
+
+    def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
+        check_count(points)
+        samples = avatar.model.draw_samples(points, torch.Generator().manual_seed(0))
+        return lambda body: self.surface(avatar, body, samples)
+
+    @torch.no_grad()
+    def surface(self, avatar: TrainedAvatar, body: BodyFit, samples: SurfaceSamples, wrinkles: bool = True) -> Surface:
+        """The dressed surface of a body, in points of the template and, with ``head=mesh``, a mesh."""
+        device = avatar.model.vertices.device
+        found = avatar.model(body_batch([body], 0, ("pose",)).to(device), samples.to(device), wrinkles)
+        cloud = join_clouds([found])
+        if found.mesh is None:
+            return Surface(cloud)
+        mesh = Mesh(found.mesh[0].float().cpu().numpy(), avatar.model.faces.cpu().numpy())
+        return Surface(cloud, mesh, constant=True)
+
+    def garment(
+        self, avatar: TrainedAvatar, outfit: str, points: int, body: BodyFit | None = None
+    ) -> PointCloud | None:
+        if not avatar.settings.template:
+            return None
+        model = avatar.model
+        samples = model.draw_samples(points, torch.Generator().manual_seed(0))
+        if body is not None:
+            return self.surface(avatar, body, samples, wrinkles=False).cloud
+        found = model.garment_template(0, model.garment_vertices)
+        mesh = torch.cat([model.vertices[: model.skin], found.points[0]])
+        normals = interpolate(vertex_normals(mesh, model.faces), samples)
+        return join_clouds([replace(found, points=interpolate(mesh, samples)[None], normals=normals[None])])
+
+    def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
+        problem = "run: expected a method whose garment is a code alone, got layered, with a template of its own."
+        raise AvatarError(f"{problem} Hint: train the new outfit by itself.")
