@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from avatar.body.skinning import skin_transforms
 from avatar.canonical.clothed_weights import diffuse_weights, inpaint_weights, tidy_weights
-from avatar.canonical.scans import local_pose
 from avatar.canonical.refinement import PosedPoints, RefineConfig, chamfer, refine
+from avatar.canonical.scans import local_pose
 from avatar.canonical.skin import SkinVote, body_offsets, label_points, vote_skin
 from avatar.canonical.winding import Winding, area_vectors, grid_around
 from avatar.checks import AvatarError, check_shape
@@ -361,12 +361,13 @@ def assemble(
     ids, faces = used_vertices(template.vertices.numpy(), skin_faces(template, bare, config.overlap))
     skin = template.vertices.numpy()[ids], template.weights.numpy()[ids]
     if garment is None:
-        return ClothedTemplate(skin[0], faces, skin[1], ids)
+        return ClothedTemplate(skin[0], faces, skin[1], ids, np.zeros(len(ids), bool))
     return ClothedTemplate(
         vertices=np.concatenate([skin[0], garment.mesh.vertices]).astype(np.float32),
         faces=np.concatenate([faces, garment.mesh.faces + len(ids)]),
         weights=np.concatenate([skin[1], garment.weights]).astype(np.float32),
         body_vertex=np.concatenate([ids, np.full(len(garment.mesh.vertices), -1)]),
+        covered=np.concatenate([~bare[ids], np.zeros(len(garment.mesh.vertices), bool)]),
     )
 
 
