@@ -106,19 +106,26 @@ class ClothedTemplate:
     """One outfit at rest in the canonical pose as one mesh: the body's own skin where it is bare, and the garment.
 
     ``vertices (V, 3)`` metres, ``faces (F, 3)``, ``weights (V, J)`` skinning weights with rows summing to 1,
-    ``body_vertex (V,)`` the body's vertex that each skin vertex is, -1 for the garment's. No face joins the two: skin
-    goes on below the garment's edge.
+    ``body_vertex (V,)`` the body's vertex that each skin vertex is, -1 for the garment's, ``covered (V,)`` bool skin
+    vertices below the garment. No face joins the two: skin goes on below the garment's edge, and a point cloud of the
+    dressed surface takes `visible_faces` alone.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     weights: np.ndarray
     body_vertex: np.ndarray
+    covered: np.ndarray
 
     @property
     def garment_faces(self) -> np.ndarray:
         """Which faces ``(F,)`` are garment, bool."""
         return (self.body_vertex[self.faces] < 0).all(axis=1)
+
+    @property
+    def visible_faces(self) -> np.ndarray:
+        """Which faces ``(F,)`` are garment or bare skin, bool: those without a covered vertex."""
+        return ~self.covered[self.faces].any(axis=1)
 
 
 @dataclass(frozen=True)

@@ -361,12 +361,13 @@ def assemble(
     ids, faces = used_vertices(template.vertices.numpy(), skin_faces(template, bare, config.overlap))
     skin = template.vertices.numpy()[ids], template.weights.numpy()[ids]
     if garment is None:
-        return ClothedTemplate(skin[0], faces, skin[1], ids)
+        return ClothedTemplate(skin[0], faces, skin[1], ids, np.zeros(len(ids), bool))
     return ClothedTemplate(
         vertices=np.concatenate([skin[0], garment.mesh.vertices]).astype(np.float32),
         faces=np.concatenate([faces, garment.mesh.faces + len(ids)]),
         weights=np.concatenate([skin[1], garment.weights]).astype(np.float32),
         body_vertex=np.concatenate([ids, np.full(len(garment.mesh.vertices), -1)]),
+        covered=np.concatenate([~bare[ids], np.zeros(len(garment.mesh.vertices), bool)]),
     )
 
 

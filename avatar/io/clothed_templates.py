@@ -12,7 +12,13 @@ from avatar.records import ClothedTemplate
 
 FORMAT = "clothed-template/1"
 UNIT_TOLERANCE = 1e-3  # of the sums of weights
-KEYS = {"vertices": "float V 3", "faces": "int F 3", "weights": "float V J", "body_vertex": "int V"}
+KEYS = {
+    "vertices": "float V 3",
+    "faces": "int F 3",
+    "weights": "float V J",
+    "body_vertex": "int V",
+    "covered": "bool V",
+}
 
 
 def write_clothed_template(path: str | Path, clothed: ClothedTemplate) -> None:
@@ -20,7 +26,7 @@ def write_clothed_template(path: str | Path, clothed: ClothedTemplate) -> None:
 
     Raises:
         AvatarError: for shapes that do not fit, non-finite numbers, weights that do not sum to 1, indices out of
-            range, or faces between skin and garment.
+            range, covered vertices of the garment, or faces between skin and garment.
     """
     check_clothed_template(clothed)
     arrays = {
@@ -29,6 +35,7 @@ def write_clothed_template(path: str | Path, clothed: ClothedTemplate) -> None:
         "faces": np.asarray(clothed.faces, np.int32),
         "weights": np.asarray(clothed.weights, np.float32),
         "body_vertex": np.asarray(clothed.body_vertex, np.int32),
+        "covered": np.asarray(clothed.covered, bool),
     }
     write_arrays(Path(path), arrays)
 
@@ -46,6 +53,7 @@ def read_clothed_template(path: str | Path) -> ClothedTemplate:
         faces=stored["faces"].astype(np.int64),
         weights=stored["weights"],
         body_vertex=stored["body_vertex"].astype(np.int64),
+        covered=stored["covered"],
     )
     try:
         check_clothed_template(clothed)
@@ -62,7 +70,8 @@ def check_clothed_template(clothed: ClothedTemplate) -> None:
     """
     dims = check_shape("vertices", clothed.vertices, "V 3")
     check_shape("weights", clothed.weights, "V J", **dims)
-    check_shape("body_vertex", clothed.body_vertex, "V", **dims)
+    for name in ("body_vertex", "covered"):
+        check_shape(name, getattr(clothed, name), "V", **dims)
     check_faces(clothed.faces, dims["V"])
     for name in ("vertices", "weights"):
         check_finite(name, getattr(clothed, name))
@@ -71,6 +80,8 @@ def check_clothed_template(clothed: ClothedTemplate) -> None:
         raise AvatarError("weights: expected no negative weight and rows summing to 1, got others.")
     if len(sums) and clothed.body_vertex.min() < -1:
         raise AvatarError(f"body_vertex: expected -1 or an index of the body, got {clothed.body_vertex.min()}.")
+    if covered := int(clothed.covered[clothed.body_vertex < 0].sum()):
+        raise AvatarError(f"covered: expected skin vertices alone, got {covered} of the garment.")
     garment = clothed.body_vertex[clothed.faces] < 0
     if (garment.any(axis=1) & ~garment.all(axis=1)).any():
         raise AvatarError("faces: expected none between skin and garment, got some.")

@@ -261,6 +261,13 @@ def test_one_scan_of_points_makes_a_template(person):
     assert facts["penetrating_share"] == 0
     skin = made.body_vertex >= 0
     assert (made.vertices[skin] == person.vertices.numpy()[made.body_vertex[skin]]).all()
+    assert made.covered.any() and not made.covered[~skin].any()
+    assert (made.covered[skin] == ~vote.bare[made.body_vertex[skin]]).all()
+    visible = made.visible_faces
+    assert visible[made.garment_faces].all() and not visible.all()  # the skin's overlap is hidden
+    assert (
+        visible[~made.garment_faces] == vote.bare[made.body_vertex[made.faces[~made.garment_faces]]].all(axis=1)
+    ).all()
     assert np.abs(made.weights.sum(axis=1) - 1).max() < 1e-5
     assert any("scan" in fault for fault in find_faults(facts, 1, vote, garment, weighed))
     hits = clothed.closest_on_mesh(garment.mesh.vertices, person.vertices.numpy(), person.faces.numpy())
@@ -278,7 +285,7 @@ def test_a_person_without_clothes_is_the_body(person):
     garment = fuse_garment(scans, person, vote, QUICK)
     assert not len(garment.mesh.faces)
     made = assemble(person, vote, None, QUICK)
-    assert len(made.vertices) == len(person.vertices) and (made.body_vertex >= 0).all()
+    assert len(made.vertices) == len(person.vertices) and (made.body_vertex >= 0).all() and made.visible_faces.all()
     assert "no garment" in find_faults(template_facts(made, person), 9, vote, garment, None)[0]
 
 
@@ -405,17 +412,23 @@ def test_the_best_weights_are_taken_and_a_missing_field_is_named(person):
 
 def test_a_clothed_template_survives_the_disk(tmp_path, person):
     made = ClothedTemplate(
-        person.vertices.numpy()[:4], np.array([[0, 1, 2]]), np.full((4, 2), 0.5, np.float32), np.array([0, 1, 2, -1])
+        person.vertices.numpy()[:4],
+        np.array([[0, 1, 2]]),
+        np.full((4, 2), 0.5, np.float32),
+        np.array([0, 1, 2, -1]),
+        np.array([False, True, False, False]),
     )
     write_clothed_template(tmp_path / "t.npz", made)
     again = read_clothed_template(tmp_path / "t.npz")
-    for name in ("vertices", "faces", "weights", "body_vertex"):
+    for name in ("vertices", "faces", "weights", "body_vertex", "covered"):
         assert (getattr(again, name) == getattr(made, name)).all()
     for change, message in (
         ({"weights": made.weights * 2}, "summing to 1"),
         ({"faces": np.array([[0, 1, 3]])}, "between skin and garment"),
         ({"faces": np.array([[0, 1, 9]])}, "faces"),
         ({"vertices": made.vertices * np.nan}, "finite"),
+        ({"covered": ~made.covered}, "skin vertices alone, got 1"),
+        ({"covered": made.covered[:3]}, "covered"),
     ):
         with pytest.raises(AvatarError, match=message):
             write_clothed_template(tmp_path / "u.npz", replace(made, **change))
