@@ -53,7 +53,9 @@ class ClothMesh(Tensors):
         one = torch.linalg.cross(end - start, first - start, dim=-1)
         other = torch.linalg.cross(second - start, end - start, dim=-1)
         sine = (torch.linalg.cross(one, other, dim=-1) * along).sum(dim=-1)
-        return torch.atan2(sine, (one * other).sum(dim=-1).where((one * other).sum(dim=-1) != 0, 1e-20))
+        cosine = (one * other).sum(dim=-1)
+        flat = sine.square() + cosine.square() < 1e-30  # a face without area has no angle
+        return torch.atan2(sine.masked_fill(flat, 0), cosine.masked_fill(flat, 1))
 
     def differences(self, values: Tensor) -> Tensor:
         """Values ``(B, V, C)`` less the mean of their neighbours' along edges (the uniform Laplacian), alike."""
@@ -89,7 +91,7 @@ def body_contact(points: Tensor, body: Tensor, faces: Tensor, gap: float) -> Ten
 
 
 def self_contact(points: Tensor, rest: Tensor, gap: float, apart: float, neighbours: int = 8) -> Tensor:
-    """Mean square of what points ``(B, N, 3)`` lack of a gap between each other, metres.
+    """Mean square of what points ``(B, N, 3)`` lack of a gap between each other, metres: the largest lack of each.
 
     Of the nearest ``neighbours``, only those count that are farther ``apart`` at rest ``(N, 3)``.
     """

@@ -16,6 +16,7 @@ from avatar.geometry.transforms import (
     invert_rigid,
     rotation_between,
     rotation_from_axis_angle,
+    tilt_rotations,
     transform_directions,
     transform_points,
 )
@@ -107,3 +108,16 @@ def test_shapes_are_checked():
         rotation_from_axis_angle(torch.zeros(4))
     with pytest.raises(AvatarError, match="linear: expected shape"):
         assemble_transform(torch.zeros(3, 4), torch.zeros(3))
+
+
+def test_tilt_is_what_no_turn_about_the_vertical_gives():
+    lean = rotation_from_axis_angle(torch.tensor([0.5, 0.0, 0.3]))
+    for yaw in (-3.0, -0.4, 0.0, 2.0):
+        turn = rotation_from_axis_angle(torch.tensor([0.0, yaw, 0.0]))
+        torch.testing.assert_close(tilt_rotations(turn @ lean), tilt_rotations(lean))
+        torch.testing.assert_close(tilt_rotations(turn), torch.eye(3))
+    tilt = tilt_rotations(lean)
+    back = lean @ tilt.T  # the turn that was taken away
+    torch.testing.assert_close(back[1], torch.tensor([0.0, 1.0, 0.0]))
+    others = [rotation_from_axis_angle(torch.tensor([0.0, yaw, 0.0])) for yaw in torch.linspace(-3, 3, 61)]
+    assert all((lean - back).norm() <= (lean - other).norm() + 1e-6 for other in others)
