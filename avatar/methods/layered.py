@@ -40,6 +40,7 @@ from avatar.records import (
 )
 
 STATE = ("vertices", "faces", "weights", "body_vertex", "covered")  # of the clothed template, saved with the weights
+SKIN_SPACING = 0.03  # metres between the skin vertices that are encoded
 REST_APART = 0.04  # metres at rest from which on two places of a garment may not touch
 TERMS = ("laplacian", "strain", "bending", "body_contact", "self_contact")
 
@@ -80,22 +81,29 @@ class LayeredAvatar(ClosetAvatar):
     """CloSET's network on the clothed template of one outfit.
 
     The template is skinned by its own weights, skin vertices are the body's own, and the network moves the garment
-    alone: its vertices (``head=mesh``) or points on it (``head=points``).
+    alone: its vertices (``head=mesh``) or points on it (``head=points``). It encodes the garment's vertices and, behind
+    them, skin vertices `SKIN_SPACING` apart, of which a body has many more in face and hands.
     """
 
     def __init__(self, template: Template, clothed: ClothedTemplate, config: LayeredConfig):
         """Builds the network on the body at rest and a clothed template, whose skin vertices come first."""
-        arrays = {name: torch.from_numpy(np.ascontiguousarray(getattr(clothed, name))) for name in STATE}
-        dressed = {name: arrays[name] for name in ("vertices", "faces", "weights")}
-        super().__init__(replace(template, **dressed, uv=None, uv_faces=None), 1, config)
-        for name, value in arrays.items():
-            self.register_buffer(name, value, persistent=True)
+        skin = int((clothed.body_vertex >= 0).sum())
+        cells = np.floor(clothed.vertices[:skin] / SKIN_SPACING)
+        seen = np.append(np.arange(skin, len(clothed.vertices)), np.unique(cells, axis=0, return_index=True)[1])
+        garment_faces = clothed.faces[clothed.garment_faces] - skin
+        arrays = {"vertices": clothed.vertices[seen], "weights": clothed.weights[seen], "faces": garment_faces}
+        encoded = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+        super().__init__(replace(template, **encoded, uv=None, uv_faces=None), 1, config)
+        for name in STATE:
+            value = torch.from_numpy(np.ascontiguousarray(getattr(clothed, name)))
+            self.register_buffer(f"clothed_{name}", value, persistent=True)
         bind = template.canonical_from_bind
         self.register_buffer("bind", torch.eye(4).expand(len(template.parents), 4, 4) if bind is None else bind)
-        self.register_buffer("body_faces", template.faces.clone(), persistent=False)
-        self.skin = int((clothed.body_vertex >= 0).sum())  # number of skin vertices
-        self.garment_faces = torch.from_numpy(clothed.faces[clothed.garment_faces] - self.skin)
-        self.shown_faces = torch.from_numpy(np.flatnonzero(clothed.visible_faces))
+        constants = {"seen": torch.from_numpy(seen), "body_faces": template.faces, "garment_faces": encoded["faces"]}
+        constants["shown_faces"] = torch.from_numpy(np.flatnonzero(clothed.visible_faces))
+        for name, value in constants.items():
+            self.register_buffer(name, value.clone(), persistent=False)
+        self.skin, self.garment_count = skin, len(clothed.vertices) - skin
         if config.head is Head.mesh:  # normals are those of the mesh
             for decoder in (getattr(self, "garment_decoder", None), self.pose_decoder):
                 if decoder is not None:
@@ -103,47 +111,56 @@ class LayeredAvatar(ClosetAvatar):
 
     @property
     def garment_vertices(self) -> SurfaceSamples:
-        """The garment's vertices as points of the template."""
-        ids = torch.arange(self.skin, len(self.vertices), device=self.vertices.device)
+        """The garment's vertices as points of what is encoded."""
+        ids = torch.arange(self.garment_count, device=self.vertices.device)
         corners = torch.eye(3, device=ids.device)[:1].expand(len(ids), 3)
         return SurfaceSamples(ids[:, None].expand(-1, 3), corners, torch.full_like(ids, -1))
 
     def draw_samples(self, points: int, generator: torch.Generator) -> SurfaceSamples:
-        """Points spread evenly by area over the template's visible surface."""
-        samples = sample_surface(self.vertices.cpu(), self.faces.cpu()[self.shown_faces], points, generator)
-        return replace(samples, face_ids=self.shown_faces[samples.face_ids])
+        """Points spread evenly by area over the clothed template's visible surface."""
+        shown = self.shown_faces.cpu()
+        samples = sample_surface(self.clothed_vertices.cpu(), self.clothed_faces.cpu()[shown], points, generator)
+        return replace(samples, face_ids=shown[samples.face_ids])
 
     @torch.no_grad()
-    def dress(self, batch: Batch) -> Batch:
-        """The batch with the clothed template, posed by its own weights, in place of the body."""
-        transforms = skin_transforms(self.weights, batch.joint_transforms, self.bind)
-        garment = transform_points(transforms[:, self.skin :], self.vertices[self.skin :])
-        vertices = torch.cat([batch.vertices[:, self.body_vertex[: self.skin]], garment], dim=1)
-        root = invert_rigid(batch.joint_transforms[:, :1])
-        seen = transform_points(root, vertices)
-        return replace(batch, vertices=vertices, vertex_transforms=transforms, pose_vertices=seen)
+    def dress(self, batch: Batch) -> tuple[Batch, Tensor]:
+        """The batch with what is encoded in place of the body, and the whole template ``(B, V, 3)``, both posed."""
+        transforms = skin_transforms(self.clothed_weights[self.seen], batch.joint_transforms, self.bind)
+        garment = transform_points(transforms, self.vertices)[:, : self.garment_count]
+        whole = torch.cat([batch.vertices[:, self.clothed_body_vertex[: self.skin]], garment], dim=1)
+        vertices = whole[:, self.seen]
+        seen = transform_points(invert_rigid(batch.joint_transforms[:, :1]), vertices)
+        return replace(batch, vertices=vertices, vertex_transforms=transforms, pose_vertices=seen), whole
 
     def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
         """As `TemplateNetwork.forward`, at points of the clothed template.
 
-        With ``head=mesh`` offsets are those of the garment's vertices, and ``mesh`` has the vertices of skin and
-        garment.
+        With ``head=mesh`` offsets are those of the garment's vertices and ``mesh`` has the vertices of skin and
+        garment; with ``head=points`` offsets are those of the points on the garment.
         """
-        dressed = self.dress(batch)
-        if self.config.head is Head.points:
-            found = super().forward(dressed, samples, wrinkles)
-            garment = (samples.vertex_ids[:, :1] >= self.skin).expand(-1, 3)
-            normals = interpolate(vertex_normals(dressed.vertices, self.faces), samples)
-            return replace(
-                found,
-                points=torch.where(garment, found.points, interpolate(dressed.vertices, samples)),
-                normals=torch.where(garment, found.normals, normalize(normals, dim=-1)),
-            )
-        found = super().forward(dressed, self.garment_vertices, wrinkles)
-        with torch.autocast(found.points.device.type, enabled=False):
-            mesh = torch.cat([dressed.vertices[:, : self.skin], found.points], dim=1)
-            normals = normalize(interpolate(vertex_normals(mesh, self.faces), samples), dim=-1, eps=1e-20)
-            return replace(found, points=interpolate(mesh, samples), normals=normals, wrinkle_normals=None, mesh=mesh)
+        encoded, whole = self.dress(batch)
+        if self.config.head is Head.mesh:
+            found = super().forward(encoded, self.garment_vertices, wrinkles)
+            with torch.autocast(found.points.device.type, enabled=False):
+                whole = torch.cat([whole[:, : self.skin], found.points], dim=1)
+                normals = interpolate(vertex_normals(whole, self.clothed_faces), samples)
+                points, normals = interpolate(whole, samples), normalize(normals, dim=-1, eps=1e-20)
+            return replace(found, points=points, normals=normals, wrinkle_normals=None, mesh=whole)
+        points = interpolate(whole, samples)
+        normals = normalize(interpolate(vertex_normals(whole, self.clothed_faces), samples), dim=-1, eps=1e-20)
+        rows = (samples.vertex_ids[:, 0] >= self.skin).nonzero()[:, 0]
+        ids = samples.vertex_ids[rows] - self.skin
+        found = super().forward(encoded, SurfaceSamples(ids, samples.barycentric[rows], ids[:, 0]), wrinkles)
+        moved = {
+            "points": points.index_copy(1, rows, found.points),
+            "normals": normals.index_copy(1, rows, found.normals),
+        }
+        return replace(found, **moved)
+
+
+def clothed_template(state: Mapping[str, Tensor]) -> ClothedTemplate:
+    """The clothed template that is part of a network's state."""
+    return ClothedTemplate(**{name: state[f"clothed_{name}"].cpu().numpy() for name in STATE})
 
 
 class LayeredTask(PointTask):
@@ -153,7 +170,7 @@ class LayeredTask(PointTask):
 
     def __init__(self, model: LayeredAvatar, *rest: Any):
         super().__init__(model, *rest)
-        self.cloth = ClothMesh.of_faces(model.garment_faces).to(self.device)
+        self.cloth = ClothMesh.of_faces(model.garment_faces.cpu()).to(self.device)
 
     def draw_points(self, key: int) -> SurfaceSamples:
         generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key)
@@ -163,14 +180,14 @@ class LayeredTask(PointTask):
         terms, config = super().objective(prediction, batch, progress), self.model.config.cloth
         if prediction.mesh is None:
             return terms
-        cloth, skin = self.cloth, self.model.skin
-        garment, flat = prediction.mesh[:, skin:], self.model.vertices[skin:]
+        cloth, model = self.cloth, self.model
+        garment, flat = prediction.mesh[:, model.skin :], model.vertices[: model.garment_count]
         rest = flat + (prediction.offsets if prediction.garment_offsets is None else prediction.garment_offsets)
         measures: dict[str, Callable[[], Tensor]] = {
             "laplacian": lambda: cloth.differences(prediction.offsets).square().sum(dim=-1).mean(),
             "strain": lambda: edge_strain(cloth.edge_lengths(garment), cloth.edge_lengths(rest)),
             "bending": lambda: bending(cloth.angles(garment), cloth.angles(rest)),
-            "body_contact": lambda: body_contact(garment, batch.vertices, self.model.body_faces, config.gap),
+            "body_contact": lambda: body_contact(garment, batch.vertices, model.body_faces, config.gap),
             "self_contact": lambda: self_contact(garment, flat, config.gap, REST_APART),
         }
         weights = {name: getattr(config, name) for name in TERMS if getattr(config, name)}
@@ -212,7 +229,7 @@ class Layered(PointMethod):
         return LayeredAvatar(template, clothed, settings)
 
     def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
-        return LayeredAvatar(template, ClothedTemplate(**{name: weights[name].numpy() for name in STATE}), settings)
+        return LayeredAvatar(template, clothed_template(weights), settings)
 
     def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
         check_count(points)
@@ -227,7 +244,7 @@ class Layered(PointMethod):
         cloud = join_clouds([found])
         if found.mesh is None:
             return Surface(cloud)
-        mesh = Mesh(found.mesh[0].float().cpu().numpy(), avatar.model.faces.cpu().numpy())
+        mesh = Mesh(found.mesh[0].float().cpu().numpy(), avatar.model.clothed_faces.cpu().numpy())
         return Surface(cloud, mesh, constant=True)
 
     def garment(
@@ -240,9 +257,11 @@ class Layered(PointMethod):
         if body is not None:
             return self.surface(avatar, body, samples, wrinkles=False).cloud
         found = model.garment_template(0, model.garment_vertices)
-        mesh = torch.cat([model.vertices[: model.skin], found.points[0]])
-        normals = interpolate(vertex_normals(mesh, model.faces), samples)
-        return join_clouds([replace(found, points=interpolate(mesh, samples)[None], normals=normals[None])])
+        mesh = torch.cat([model.clothed_vertices[: model.skin], found.points[0]])
+        normals = interpolate(vertex_normals(mesh, model.clothed_faces), samples.to(mesh.device))
+        return join_clouds(
+            [replace(found, points=interpolate(mesh, samples.to(mesh.device))[None], normals=normals[None])]
+        )
 
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         problem = "run: expected a method whose garment is a code alone, got layered, with a template of its own."
