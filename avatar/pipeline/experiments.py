@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
+from avatar.canonical.clothed import ClothedConfig
 from avatar.checks import AvatarError, check_name
 from avatar.data.folders import SPLITS, VALIDATION
 from avatar.environment import prepared_process
@@ -22,7 +23,7 @@ from avatar.implicit.extraction import ExtractionConfig
 from avatar.invocation import CONF
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole
-from avatar.methods.base import CANONICALIZER
+from avatar.methods.base import CANONICALIZER, CLOTHED_TEMPLATE
 from avatar.methods.canonicalizer import CanonicalizeConfig
 from avatar.methods.points import check_count
 from avatar.methods.registry import find_method
@@ -31,6 +32,7 @@ from avatar.pipeline.canonicalization import canonicalize, check_scored, make_ca
 from avatar.pipeline.reporting import CompareConfig, ReportConfig, compare, report
 from avatar.pipeline.scores import EvaluateConfig, PredictConfig, evaluate, predict, scores_file
 from avatar.pipeline.surfaces import MeshConfig, mesh
+from avatar.runs.templating import TemplateConfig, make_template
 from avatar.runs.training import train
 from avatar.settings import settings_from_dict
 from avatar.world import current_world
@@ -45,6 +47,7 @@ class JobConfig(RunConfig):
     points: int = 50000  # predicted a frame
     score: ScoreConfig = field(default_factory=ScoreConfig)
     canonicalizer: CanonicalizeConfig = field(default_factory=CanonicalizeConfig)  # its data and name are the run's
+    clothed: ClothedConfig = field(default_factory=ClothedConfig)  # the clothed template, for methods that take one
 
     def __post_init__(self):
         super().__post_init__()
@@ -134,6 +137,10 @@ def demo(config: DemoConfig) -> Path:
     load_pyvista()
     with stage("canonicalize"):
         canonicalized = [canonicalize(canonicalizer_of(config, outfit)) for outfit in settings.outfit]
+    if CLOTHED_TEMPLATE in needs_of(config):
+        with stage("template"):
+            for outfit in settings.outfit:
+                make_template(template_of(config, outfit))
     with stage("train"):
         run = train(settings)
     with stage("train static floor"):
@@ -165,9 +172,9 @@ def demo(config: DemoConfig) -> Path:
 
 @prepared_process()
 def experiment(config: ExperimentConfig) -> Path | list[Path]:
-    """Canonicalizes where the method needs it, trains, predicts and scores; gives the run's folder. What is finished is
-    not done again; what prediction, scores or pictures would refuse is refused before any work. A job that is left out
-    (``one_seed``) makes nothing and gives an empty list.
+    """Canonicalizes and makes the clothed template where the method needs them, trains, predicts and scores; gives the
+    run's folder. What is finished is not done again; what prediction, scores or pictures would refuse is refused before
+    any work. A job that is left out (``one_seed``) makes nothing and gives an empty list.
     """
     if config.is_left_out:
         log.info("%s has seed 0 alone (one_seed): nothing to do.", config.method.variant)
@@ -183,6 +190,8 @@ def experiment(config: ExperimentConfig) -> Path | list[Path]:
     for settings in makers:
         with lock_folder(settings.folder, wait=True):  # another job may be making it
             make_canonical_scans(settings, settings.frames())
+            if CLOTHED_TEMPLATE in needs_of(config):
+                make_template(template_of(config, settings.outfit))
     run = train(config.run)
     made = {"points": config.points, "surface": config.surface, "device": config.device}
     for split in config.compare.splits if is_main else ():  # what the folder's ledgers know is not done again
@@ -198,12 +207,21 @@ def canonicalizer_of(config: JobConfig, outfit: str) -> CanonicalizeConfig:
     return replace(config.canonicalizer, outfit=outfit, name=config.canonical, **shared)
 
 
+def template_of(config: JobConfig, outfit: str) -> TemplateConfig:
+    """The settings of the clothed template that a job's run takes for an outfit; without pictures."""
+    shared = {name: getattr(config, name) for name in ("dataset", "data_root", "runs_root", "canonical", "clothed")}
+    return TemplateConfig(outfit=outfit, pictures=0, **shared)
+
+
+def needs_of(config: JobConfig) -> frozenset[str]:
+    """What a job's method needs made of the outfits, as `Method.needs`."""
+    method, run = find_method(config.method.name), config.run
+    return method.needs(run, settings_from_dict(method.Settings, run.method.settings, "method.settings."))
+
+
 def canonicalizers_of(config: ExperimentConfig) -> list[CanonicalizeConfig]:
     """The settings of the canonicalizers that an experiment's run needs, one an outfit."""
-    method, run = find_method(config.method.name), config.run
-    settings = settings_from_dict(method.Settings, run.method.settings, "method.settings.")
-    needed = CANONICALIZER in method.needs(run, settings)
-    return [canonicalizer_of(config, outfit) for outfit in config.outfit] if needed else []
+    return [canonicalizer_of(config, outfit) for outfit in config.outfit if CANONICALIZER in needs_of(config)]
 
 
 def tabulate_experiment(configs: Sequence[ExperimentConfig]) -> Path:
