@@ -73,8 +73,10 @@ def edge_strain(lengths: Tensor, rest: Tensor) -> Tensor:
     return ((lengths - rest) / rest.clamp(min=1e-6)).square().mean()
 
 
-def bending(angles: Tensor, rest: Tensor) -> Tensor:
-    """Mean squared change of hinges' angles ``(B, H)`` against those at rest, radians; a full turn is none."""
+def bending(angles: Tensor, rest: Tensor | None = None) -> Tensor:
+    """Mean squared angle of hinges ``(B, H)``, radians, or change against those at rest, of which a full turn is none."""
+    if rest is None:
+        return angles.square().mean()
     turn = angles - rest
     return torch.atan2(turn.sin(), turn.cos()).square().mean()
 

@@ -58,13 +58,14 @@ class ClothConfig:
 
     laplacian: float = 4e4  # mean square of how offsets differ from the mean of their neighbours'
     strain: float = 1.0  # mean squared strain of edges, against the garment template's
-    bending: float = 0.05  # mean squared change of the angles between faces, against the garment template's
+    bending: float = 2.0  # mean squared angle between faces: cloth is flat at rest
+    bent_rest: bool = False  # bending counts from the garment template's angles instead
     body_contact: float = 1e4  # mean square of what vertices lack of the gap to the body
     self_contact: float = 0.0  # the same between parts of the garment that are apart at rest
     gap: float = 0.003  # metres, from body to garment and from garment to garment
 
     def __post_init__(self):
-        check_range(self, *vars(self), low=0)
+        check_range(self, *TERMS, "gap", low=0)
 
 
 @dataclass
@@ -186,7 +187,7 @@ class LayeredTask(PointTask):
         measures: dict[str, Callable[[], Tensor]] = {
             "laplacian": lambda: cloth.differences(prediction.offsets).square().sum(dim=-1).mean(),
             "strain": lambda: edge_strain(cloth.edge_lengths(garment), cloth.edge_lengths(rest)),
-            "bending": lambda: bending(cloth.angles(garment), cloth.angles(rest)),
+            "bending": lambda: bending(cloth.angles(garment), cloth.angles(rest) if config.bent_rest else None),
             "body_contact": lambda: body_contact(garment, batch.vertices, model.body_faces, config.gap),
             "self_contact": lambda: self_contact(garment, flat, config.gap, REST_APART),
         }

@@ -39,7 +39,8 @@ def test_bending_is_the_change_of_the_angle_on_either_side(angle):
     assert abs(float(flat)) < 1e-6
     assert abs(float(CLOTH.angles(folded(angle)))) == pytest.approx(abs(angle), rel=1e-4)
     assert float(CLOTH.angles(folded(angle))) == pytest.approx(-float(CLOTH.angles(folded(-angle))), rel=1e-4)
-    assert float(bending(CLOTH.angles(folded(angle)), flat)) == pytest.approx(angle**2, rel=1e-3)
+    for rest in (flat, None):
+        assert float(bending(CLOTH.angles(folded(angle)), rest)) == pytest.approx(angle**2, rel=1e-3)
     near = bending(CLOTH.angles(folded(3.1)), CLOTH.angles(folded(-3.1)))  # across the half turn
     assert float(near) == pytest.approx((2 * math.pi - 6.2) ** 2, rel=1e-2)
 

@@ -134,7 +134,7 @@ def test_each_term_of_the_mesh_has_its_switch_and_moves_the_network(term):
 
 
 def test_the_garment_template_alone_is_neither_strained_nor_bent():
-    model = layered(pose=False)
+    model = layered(pose=False, cloth=ClothConfig(bent_rest=True))
     task = LayeredTask(model, TEMPLATE, TrainConfig(points=200), lambda step: BATCH, 3)
     rigid = replace(BATCH, joint_transforms=torch.eye(4).expand(3, 1, 4, 4))
     raw = task.loss((rigid, draw(model)), Position(0, 1.0)).raw
