@@ -74,7 +74,7 @@ def edge_strain(lengths: Tensor, rest: Tensor) -> Tensor:
 
 
 def bending(angles: Tensor, rest: Tensor | None = None) -> Tensor:
-    """Mean squared angle of hinges ``(B, H)``, radians, or change against those at rest, of which a full turn is none."""
+    """Mean squared angle of hinges ``(B, H)``, radians, or how far it is from those at rest; a full turn is none."""
     if rest is None:
         return angles.square().mean()
     turn = angles - rest
