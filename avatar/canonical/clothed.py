@@ -26,7 +26,7 @@ from avatar.canonical.winding import Winding, area_vectors, grid_around
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.closest import closest_on_mesh
 from avatar.geometry.laplacians import boundary_edges, mesh_parts, smooth_votes, vertex_areas
-from avatar.geometry.remeshing import cut_at_level, isotropic_remesh, smooth_borders, used_vertices
+from avatar.geometry.remeshing import cut_at_level, even_triangles, manifold_faults, smooth_borders, used_vertices
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import transform_points
 from avatar.geometry.trees import build_tree
@@ -180,7 +180,7 @@ def fuse_garment(
     part = cut_at_level(surface.vertices, surface.faces, share, 0.5)
     part, dropped = drop_small_parts(part, config.smallest_part)
     if len(part.faces):
-        part = isotropic_remesh(part, config.edge)
+        part = even_triangles(part, surface, config.edge)
         part = Mesh(smooth_borders(part.vertices, part.faces, BORDER_ROUNDS), part.faces)
         part = Mesh(push_out(part.vertices, template, config.clearance), part.faces)
     return Garment(part, filled, dropped)
@@ -386,7 +386,7 @@ def template_facts(clothed: ClothedTemplate, template: Template) -> dict[str, fl
     if not len(faces):
         return facts
     edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    unique, number = np.unique(edges, axis=0, return_counts=True)
+    unique = np.unique(edges, axis=0)
     lengths = np.linalg.norm(vertices[unique[:, 0]] - vertices[unique[:, 1]], axis=1)
     corners = vertices[faces]
     sides = np.square(corners - np.roll(corners, -1, axis=1)).sum(axis=(1, 2))
@@ -397,7 +397,7 @@ def template_facts(clothed: ClothedTemplate, template: Template) -> dict[str, fl
     return facts | {
         "garment_parts": len(np.unique(mesh_parts(faces, len(vertices)))),
         "hems": len(np.unique(loops[around[:, 0]])),
-        "edges_of_three_faces": int((number > 2).sum()),
+        "manifold_faults": manifold_faults(faces),
         "edge_median_m": float(np.median(lengths)),
         "edge_1_percent_m": float(np.quantile(lengths, 0.01)),
         "edge_99_percent_m": float(np.quantile(lengths, 0.99)),
@@ -426,8 +426,8 @@ def find_faults(
         )
     if garment.dropped:
         faults.append(f"{len(garment.dropped)} small parts were dropped, {sum(garment.dropped):.4f} m^2.")
-    if facts["edges_of_three_faces"]:
-        faults.append(f"{facts['edges_of_three_faces']} edges have more than two faces.")
+    if facts["manifold_faults"]:
+        faults.append(f"the garment is no manifold at {facts['manifold_faults']} places. Hint: a smaller clothed.edge.")
     if facts["hems"] == 0:
         faults.append("the garment has no opening.")
     if facts["penetrating_share"] > 0.02:

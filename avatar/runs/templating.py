@@ -27,7 +27,7 @@ from avatar.canonical.clothed import (
 from avatar.canonical.refinement import PosedPoints
 from avatar.canonical.scans import root_joint_transforms, to_root_frame
 from avatar.canonical.skin import SkinVote
-from avatar.checks import AvatarError, DataError, check_name
+from avatar.checks import AvatarError, DataError, check_name, require
 from avatar.data.batches import LruSequence
 from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
@@ -134,8 +134,9 @@ def make_template(config: TemplateConfig) -> Path:
 
     Raises:
         DataError: without canonical scans, with the command that makes them.
-        AvatarError: when the scans do not make a surface.
+        AvatarError: when the scans do not make a surface, or without pyacvd.
     """
+    require("pyacvd")
     outfit = config.find_outfit()
     run = config.find_run(outfit)
     names, scans = template_scans(run, outfit)
