@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 
 import numpy as np
@@ -78,6 +79,7 @@ def even_triangles(part: Mesh, surface: Mesh, edge: float) -> Mesh:
     whole = widen(part, border, surface, edge / 2) if len(border) else part
     area = trimesh.triangles.area(whole.vertices[whole.faces]).sum()
     count = max(FEWEST_CLUSTERS, round(area / (edge**2 * np.sqrt(3) / 2)))
+    logging.getLogger("pyacvd").setLevel(logging.WARNING)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pyacvd asks pyvista for what it has renamed
         polygons = require("pyvista").PolyData.from_regular_faces(whole.vertices.astype(np.float64), whole.faces)
