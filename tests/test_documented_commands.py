@@ -52,6 +52,7 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         "python tools/evaluate.py runs=[runs/static/sample/dress/default,runs/closet/sample/dress/default]",
         f"python tools/predict.py run={FIRST} motion=walk.npz",
         "python tools/train.py outfit=dress method=pop",
+        "python tools/canonicalize.py dataset=sample outfit=dress",
     ),
     (
         "python tools/experiment.py experiment=closet5",

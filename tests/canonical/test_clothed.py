@@ -312,16 +312,16 @@ def test_a_hole_of_all_scans_is_filled_and_an_opening_is_not(person):
     assert (closed == 1).all() and len(areas) == 1 and areas[0] == pytest.approx(np.pi * 0.01, rel=0.4)
     spine = torch.linspace(0.1, 0.5, 200)[:, None] * torch.tensor([0.0, 0.0, 1.0])  # a limb through the hole
     through = replace(person, vertices=spine)
-    assert fill_holes(sphere, share, support, through)[1] == ()
+    assert fill_holes(sphere, share, support, through)[1] == []
     support[hole, 0] = 1  # skin
-    assert fill_holes(sphere, share, support, outside)[1] == ()
+    assert fill_holes(sphere, share, support, outside)[1] == []
 
 
 def test_small_parts_are_dropped_and_counted():
     large, small = icosphere(0.3), icosphere(0.02)
     both = beside(large, small)
     kept, dropped = drop_small_parts(both, 0.01)
-    assert len(kept.faces) == len(large.faces) and dropped == (pytest.approx(4 * np.pi * 0.0004, rel=0.02),)
+    assert len(kept.faces) == len(large.faces) and dropped == [pytest.approx(4 * np.pi * 0.0004, rel=0.02)]
 
 
 def test_skin_goes_on_below_the_garment_by_the_overlap(person):
