@@ -135,7 +135,7 @@ def halves(chosen: set[str], done: dict[str, Outcome]) -> tuple[list[str], list[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", RUN)
+@pytest.mark.parametrize("command", RUN, ids=lambda command: command[:90])
 def test_the_command_does_what_it_says(command, outcomes):
     outcome = outcomes[command]
     assert outcome.code == 0, f"{command}\nended with {outcome.code}:\n{outcome.output[-4000:]}"
