@@ -20,7 +20,7 @@ PIPE_CLOSED = 128 + 13  # as a shell reports a process that SIGPIPE ended: the r
 PACKAGE = Path(__file__).resolve().parent
 CORE = ("torch", "numpy", "scipy", "trimesh", "roma", "hydra", "tqdm", "safetensors", "matplotlib", "skimage")
 EXTRAS = {"open3d": "mesh", "pyvista": "pictures", "pygltflib": "export", "pxr": "export", "tensorboard": "log"}
-EXTRAS |= {"newton": "simulate", "warp": "simulate", "anny": "anny", "hydra_plugins": "cluster"}
+EXTRAS |= {"newton": "simulate", "warp": "simulate", "anny": "anny", "pyacvd": "mesh", "hydra_plugins": "cluster"}
 # Where a distribution is named otherwise than what is imported
 DISTRIBUTIONS = {"hydra": "hydra-core", "skimage": "scikit-image", "pxr": "usd-core", "warp": "warp-lang"}
 DISTRIBUTIONS |= {"open3d": "open3d-cpu"}

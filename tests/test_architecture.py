@@ -54,6 +54,7 @@ ONLY_IN = {  # package: the subpackages that may name it at all
     "hydra": {"config", "arguments"},
     "omegaconf": {"config", "arguments"},
     "open3d": {"export"},
+    "pyacvd": {"geometry", "runs"},
     "newton": {"simulate"},
     "warp": {"simulate"},
     "triton": {"geometry", "export"},  # in export: loaded before VTK

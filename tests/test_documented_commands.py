@@ -52,6 +52,7 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         "python tools/evaluate.py runs=[runs/static/sample/dress/default,runs/closet/sample/dress/default]",
         f"python tools/predict.py run={FIRST} motion=walk.npz",
         "python tools/train.py outfit=dress method=pop",
+        "python tools/canonicalize.py dataset=sample outfit=dress",
     ),
     (
         "python tools/experiment.py experiment=closet5",
@@ -134,7 +135,7 @@ def halves(chosen: set[str], done: dict[str, Outcome]) -> tuple[list[str], list[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", RUN)
+@pytest.mark.parametrize("command", RUN, ids=lambda command: command[:90])
 def test_the_command_does_what_it_says(command, outcomes):
     outcome = outcomes[command]
     assert outcome.code == 0, f"{command}\nended with {outcome.code}:\n{outcome.output[-4000:]}"

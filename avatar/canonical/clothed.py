@@ -6,13 +6,14 @@ open hems, even triangles), `weigh_garment` (skinning weights and their measure)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 
 import numpy as np
 import torch
+import trimesh
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from torch import Tensor, nn
@@ -26,10 +27,11 @@ from avatar.canonical.winding import Winding, area_vectors, grid_around
 from avatar.checks import AvatarError, check_shape
 from avatar.geometry.closest import closest_on_mesh
 from avatar.geometry.laplacians import boundary_edges, mesh_parts, smooth_votes, vertex_areas
-from avatar.geometry.remeshing import cut_at_level, isotropic_remesh, smooth_borders, used_vertices
+from avatar.geometry.remeshing import cut_at_level, even_triangles, manifold_faults, smooth_borders, used_vertices
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.transforms import transform_points
 from avatar.geometry.trees import build_tree
+from avatar.progress import tracked
 from avatar.records import CanonicalScan, ClothedTemplate, Mesh, Template
 
 FEWEST_POINTS = 500  # of a scan; with fewer its surface cannot be told from its noise
@@ -57,9 +59,7 @@ class ClothedConfig:
     """How canonical scans become a clothed template."""
 
     spacing: float = 0.008  # metres between nodes of the fusion's grid
-    level: float = (
-        0.3  # of the scans that have a place inside, and a surface there; refinement takes back too long hems
-    )
+    level: float = 0.3  # share of the scans that have a place inside, and a surface there
     edge: float = 0.018  # metres, edges of the garment's triangles
     smooth: float = 0.015  # metres over which votes for skin and for openings are smoothed
     smallest_skin: float = 0.01  # square metres; smaller islands of skin or cover on the body are overruled
@@ -123,54 +123,36 @@ class ScanInPose:
         return label_points(*self.posed, self.body, self.body_normals, vote)
 
 
-Track = Callable[[Sequence, str], Iterable]  # gives the items of a sequence and shows how far it came
-
-
-def _untracked(items: Sequence, _: str) -> Iterable:
-    return items
-
-
 def check_any(scans: Sequence) -> None:
     """Refuses to make a template of nothing. Raises `AvatarError`."""
     if not len(scans):
         raise AvatarError("scans: expected at least one canonical scan, got none. Hint: run tools/canonicalize.py.")
 
 
-def find_skin(
-    scans: Sequence[ScanInPose], template: Template, config: ClothedConfig, track: Track = _untracked
-) -> SkinVote:
+def find_skin(scans: Sequence[ScanInPose], template: Template, config: ClothedConfig) -> SkinVote:
     """Which body vertices are bare, by the vote of all scans in their own poses (`skin.vote_skin`).
-
-    Raises:
-        AvatarError: without scans, or when none comes near the body.
+    Raises `AvatarError` without scans, or when none comes near the body.
     """
     check_any(scans)
-    rows = [body_offsets(*scan.posed, scan.body, scan.body_normals) for scan in track(scans, "skin")]
+    rows = [body_offsets(*scan.posed, scan.body, scan.body_normals) for scan in tracked(scans, "skin", unit="scan")]
     return vote_skin(np.stack(rows), template, config.smooth, config.smallest_skin)
 
 
 @dataclass(frozen=True)
 class Garment:
-    """The garment's mesh in the canonical pose, and what its making came upon.
-
-    ``filled`` and ``dropped`` areas (square metres) of holes that were closed and of small parts that were left out.
-    """
+    """The garment's mesh in the canonical pose, and what its making came upon: areas, square metres."""
 
     mesh: Mesh
-    filled: tuple[float, ...] = ()
-    dropped: tuple[float, ...] = ()
+    filled: list[float]  # holes that were closed
+    dropped: list[float]  # small parts that were left out
 
 
-def fuse_garment(
-    scans: Sequence[ScanInPose], template: Template, vote: SkinVote, config: ClothedConfig, track: Track = _untracked
-) -> Garment:
+def fuse_garment(scans: Sequence[ScanInPose], template: Template, vote: SkinVote, config: ClothedConfig) -> Garment:
     """The surface that scans agree on where they do not show skin: open at hems, of even triangles.
-
-    Raises:
-        AvatarError: without scans, when they agree on no inside, or need too fine a grid.
+    Raises `AvatarError` without scans, when they agree on no inside, or need too fine a grid.
     """
     check_any(scans)
-    fused = fuse_scans(scans, template, vote, config, track)
+    fused = fuse_scans(scans, template, vote, config)
     surface = fused.surface(config.level)
     support = fused.support(surface.vertices)
     supported = support.sum(axis=1) > config.level
@@ -180,15 +162,13 @@ def fuse_garment(
     part = cut_at_level(surface.vertices, surface.faces, share, 0.5)
     part, dropped = drop_small_parts(part, config.smallest_part)
     if len(part.faces):
-        part = isotropic_remesh(part, config.edge)
+        part = even_triangles(part, surface, config.edge)
         part = Mesh(smooth_borders(part.vertices, part.faces, BORDER_ROUNDS), part.faces)
         part = Mesh(push_out(part.vertices, template, config.clearance), part.faces)
     return Garment(part, filled, dropped)
 
 
-def fuse_scans(
-    scans: Sequence[ScanInPose], template: Template, vote: SkinVote, config: ClothedConfig, track: Track = _untracked
-) -> Winding:
+def fuse_scans(scans: Sequence[ScanInPose], template: Template, vote: SkinVote, config: ClothedConfig) -> Winding:
     """The mean winding number of the scans nearest to the canonical pose, told apart by skin and garment."""
     body = template.vertices.numpy()
     low, high, spacings = body.min(axis=0), body.max(axis=0), []
@@ -201,7 +181,7 @@ def fuse_scans(
         low[0], high[0] = min(low[0], -high[0]), max(high[0], -low[0])
     grid = grid_around(low, high, config.spacing)
     across = np.array([-1.0, 1.0, 1.0])
-    for index in track(chosen, "fusion"):
+    for index in tracked(chosen, "fusion", unit="scan"):
         scan = scans[index]
         vectors, garment = area_vectors(scan.scan), scan.garment_points(vote)
         spacings.append(float(np.sqrt(np.median(np.linalg.norm(vectors, axis=1)))))
@@ -227,7 +207,7 @@ def near_canonical(scans: Sequence[ScanInPose], template: Template, share: float
 
 def fill_holes(
     surface: Mesh, share: np.ndarray, support: np.ndarray, template: Template
-) -> tuple[np.ndarray, tuple[float, ...]]:
+) -> tuple[np.ndarray, list[float]]:
     """Garment shares ``(V,)`` with holes of the scans closed, and the areas of those.
 
     A patch that no scan supports is an opening where skin is part of it or the body goes through it, and where it is
@@ -250,26 +230,25 @@ def fill_holes(
             continue
         share[inside] = 1
         filled.append(float(areas[inside].sum()))
-    return share, tuple(filled)
+    return share, filled
 
 
-def drop_small_parts(mesh: Mesh, smallest: float) -> tuple[Mesh, tuple[float, ...]]:
+def drop_small_parts(mesh: Mesh, smallest: float) -> tuple[Mesh, list[float]]:
     """The mesh without connected parts below an area, square metres, and the areas of those."""
     if not len(mesh.faces):
-        return mesh, ()
+        return mesh, []
     part = mesh_parts(mesh.faces, len(mesh.vertices))
     sizes = np.bincount(part, vertex_areas(mesh.vertices, mesh.faces))
     kept = sizes[part[mesh.faces[:, 0]]] >= smallest
     used, faces = used_vertices(mesh.vertices, mesh.faces[kept])
-    return Mesh(mesh.vertices[used], faces), tuple(float(size) for size in sizes[(sizes < smallest) & (sizes > 0)])
+    return Mesh(mesh.vertices[used], faces), sizes[(sizes < smallest) & (sizes > 0)].tolist()
 
 
 def push_out(vertices: np.ndarray, template: Template, clearance: float) -> np.ndarray:
     """Garment vertices ``(V, 3)`` at least a clearance outside the body at rest, moved along the way to its surface."""
     body, faces = template.vertices.numpy(), template.faces.numpy()
     hits = closest_on_mesh(vertices, body, faces)
-    corners = body[faces[hits.face_ids]].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = trimesh.triangles.cross(body[faces[hits.face_ids]].astype(np.float64))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     close = hits.signed_distances < clearance
     return np.where(close[:, None], hits.points + clearance * normals, vertices)
@@ -299,15 +278,11 @@ def weigh_garment(
     held_back: Sequence[PosedPoints],
     config: ClothedConfig,
 ) -> WeighedGarment:
-    """Skinning weights of the garment by three sources, measured, and both refined by the better one.
+    """Skinning weights of the canonical garment by three sources, measured, and both refined by the better one.
 
-    Args:
-        garment: the mesh in the canonical pose.
-        template: the body at rest.
-        forward_field: the canonicalizer's, ``(1, N, 3)`` to ``(1, N, J)``; None leaves the learned weights out.
-        learned: garment points of the scans that refinement may see.
-        held_back: of those that it may not; measured against ``learned`` where there are none.
-        config: which weights, and how refined.
+    ``forward_field`` is the canonicalizer's, ``(1, N, 3)`` to ``(1, N, J)``; None leaves the learned weights out.
+    Refinement sees the garment points of the scans in ``learned``; what is measured are those in ``held_back``, and
+    ``learned`` where there are none.
     """
     found = {}
     if forward_field is not None:
@@ -321,8 +296,7 @@ def weigh_garment(
         raise AvatarError(
             f"weights: expected a run with learned weights for {kind}, this one has none. Hint: weights=best."
         )
-    mesh, weights = garment, found[kind]
-    refined = False
+    mesh, weights, refined = garment, found[kind], False
     if config.refine.steps:
         better = refine(mesh, weights, learned, bind, config.refine)
         pushed = replace(better.mesh, vertices=push_out(better.mesh.vertices, template, config.clearance))
@@ -381,27 +355,25 @@ def template_facts(clothed: ClothedTemplate, template: Template) -> dict[str, fl
         "faces": len(clothed.faces),
         "skin_vertices": int((clothed.body_vertex >= 0).sum()),
         "garment_vertices": len(vertices),
-        "garment_area_m2": float(vertex_areas(vertices, faces).sum()) if len(faces) else 0.0,
+        "garment_area_m2": float(trimesh.triangles.area(vertices[faces]).sum()),
     }
     if not len(faces):
         return facts
-    edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    unique, number = np.unique(edges, axis=0, return_counts=True)
-    lengths = np.linalg.norm(vertices[unique[:, 0]] - vertices[unique[:, 1]], axis=1)
+    lengths = trimesh.Trimesh(vertices, faces, process=False).edges_unique_length
     corners = vertices[faces]
     sides = np.square(corners - np.roll(corners, -1, axis=1)).sum(axis=(1, 2))
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    qualities = 4 * np.sqrt(3) * trimesh.triangles.area(corners) / np.maximum(sides, 1e-20)
     hits = closest_on_mesh(vertices, template.vertices.numpy(), template.faces.numpy())
     around = boundary_edges(faces)
     loops = mesh_parts(np.concatenate([around, around[:, 1:]], axis=1), len(vertices))
     return facts | {
         "garment_parts": len(np.unique(mesh_parts(faces, len(vertices)))),
         "hems": len(np.unique(loops[around[:, 0]])),
-        "edges_of_three_faces": int((number > 2).sum()),
+        "manifold_faults": manifold_faults(faces),
         "edge_median_m": float(np.median(lengths)),
         "edge_1_percent_m": float(np.quantile(lengths, 0.01)),
         "edge_99_percent_m": float(np.quantile(lengths, 0.99)),
-        "triangle_quality_1_percent": float(np.quantile(4 * np.sqrt(3) * areas / np.maximum(sides, 1e-20), 0.01)),
+        "triangle_quality_1_percent": float(np.quantile(qualities, 0.01)),
         "penetrating_share": float((hits.signed_distances < -DEEP).mean()),
     }
 
@@ -426,8 +398,8 @@ def find_faults(
         )
     if garment.dropped:
         faults.append(f"{len(garment.dropped)} small parts were dropped, {sum(garment.dropped):.4f} m^2.")
-    if facts["edges_of_three_faces"]:
-        faults.append(f"{facts['edges_of_three_faces']} edges have more than two faces.")
+    if facts["manifold_faults"]:
+        faults.append(f"the garment is no manifold at {facts['manifold_faults']} places. Hint: a smaller clothed.edge.")
     if facts["hems"] == 0:
         faults.append("the garment has no opening.")
     if facts["penetrating_share"] > 0.02:

@@ -36,12 +36,8 @@ def inpaint_weights(mesh: Mesh, template: Template) -> np.ndarray:
 
     A vertex takes the weights of the closest point of the body where that is within 5% of the garment's diagonal and
     the normals are within 30 degrees; all others are inpainted by the smoothest function that agrees with those:
-    minimal ``tr W^T (L + L M^-1 L) W``, in units of the garment's diagonal. Then negative weights go, the eight largest
-    are kept and scaled to sum to 1. Connected parts without a vertex that agrees take the closest point's.
-
-    Args:
-        mesh: the garment in the canonical pose, outward normals.
-        template: the body at rest in that pose.
+    minimal ``tr W^T (L + L M^-1 L) W``, in units of the garment's diagonal; then `tidy_weights`. Connected parts
+    without a vertex that agrees take the closest point's. Garment and body in the canonical pose, wound outwards.
     """
     vertices = np.asarray(mesh.vertices, np.float64)
     found, distances, normals = body_weights_at(vertices, template)
@@ -67,10 +63,6 @@ def diffuse_weights(mesh: Mesh, template: Template) -> np.ndarray:
 
     Solves ``(L + M H) W = M H B`` with B the closest point's weights and H one over the squared distance to it: close
     cloth keeps the body's weights, far cloth blends those of all the body around it. Positive, and sums to 1.
-
-    Args:
-        mesh: the garment in the canonical pose.
-        template: the body at rest in that pose.
     """
     vertices = np.asarray(mesh.vertices, np.float64)
     found, distances, _ = body_weights_at(vertices, template)
@@ -81,9 +73,7 @@ def diffuse_weights(mesh: Mesh, template: Template) -> np.ndarray:
 
 def tidy_weights(weights: np.ndarray) -> np.ndarray:
     """Weights ``(V, J)`` without negative values, the eight largest of each row scaled to sum to 1, float32.
-
-    Raises:
-        AvatarError: for a row without any positive weight.
+    Raises `AvatarError` for a row without any positive weight.
     """
     check_shape("weights", weights, "V J")
     weights = np.maximum(weights, 0)

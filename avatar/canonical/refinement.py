@@ -58,10 +58,9 @@ class SmoothFields:
 
     def __init__(self, mesh: Mesh, length: float):
         """Factorises the mesh's screened Laplacian once; ``length`` metres."""
-        masses = np.maximum(vertex_areas(mesh.vertices, mesh.faces), 1e-12)
+        self.masses = np.maximum(vertex_areas(mesh.vertices, mesh.faces), 1e-12)
         stiffness = cotangent_laplacian(mesh.vertices, mesh.faces, positive=True)
-        self.solver = splu((diags(masses) + length**2 * stiffness).tocsc())
-        self.masses = masses
+        self.solver = splu((diags(self.masses) + length**2 * stiffness).tocsc())
 
     def __call__(self, values: Tensor) -> Tensor:
         """Fields ``(V, C)`` smoothed."""
@@ -91,17 +90,10 @@ def pose_mesh(
 def chamfer(
     mesh: Mesh, weights: np.ndarray, scans: Sequence[PosedPoints], canonical_from_bind: Tensor | None, samples: int
 ) -> float:
-    """Mean squared Chamfer distance, m^2, of a skinned mesh to posed scans: both directions added, over all scans.
+    """Mean squared Chamfer distance, m^2, of a canonical mesh skinned by ``weights (V, J)`` to posed scans.
 
-    Args:
-        mesh: the surface in the canonical pose.
-        weights: ``(V, J)``.
-        scans: at least one.
-        canonical_from_bind: of the body, or None.
-        samples: points on the mesh, evenly spread.
-
-    Raises:
-        AvatarError: without scans.
+    Both directions added, over all scans, from ``samples`` points spread evenly on the mesh. Raises `AvatarError`
+    without scans.
     """
     if not scans:
         raise AvatarError("scans: expected at least one to measure against, got none.")
@@ -149,14 +141,8 @@ def refine(
     Chamfer distance both ways between points of the garment and of the scans, a few scans a step. Displacements and
     changes of the weights' logarithms pass through `SmoothFields`. A static mesh cannot follow what a pose does to the
     cloth; what it can take from the scans is their mean over poses. Judge it by its looks as well: with little
-    smoothing the same distance falls further and the surface is shredded.
-
-    Args:
-        mesh: the garment in the canonical pose.
-        weights: ``(V, J)``, rows summing to 1.
-        scans: garment points of posed scans.
-        canonical_from_bind: of the body, or None.
-        config: steps, rates and smoothness.
+    smoothing the same distance falls further and the surface is shredded. ``mesh`` is in the canonical pose, ``scans``
+    hold the garment's points alone, rows of ``weights (V, J)`` sum to 1.
     """
     fields = SmoothFields(mesh, config.length)
     start, faces = torch.as_tensor(mesh.vertices).float(), torch.as_tensor(mesh.faces)

@@ -35,13 +35,8 @@ def body_offsets(
 
     Near vertices: the median over the scan points around of the distance along both normals' mean, which is exact on
     a sphere and so not biased where the body is round. Other vertices that scan points are nearest to (of all body
-    vertices), seen from them through the cloth: the median distance to those points.
-
-    Args:
-        points: ``(M, 3)`` posed scan, metres.
-        normals: ``(M, 3)`` unit.
-        vertices: ``(V, 3)`` the body in the same pose.
-        vertex_normals: ``(V, 3)`` unit.
+    vertices), seen from them through the cloth: the median distance to those points. Scan ``points (M, 3)`` and body
+    ``vertices (V, 3)`` in one pose, metres, with unit normals.
     """
     check_shape("normals", normals, "M 3", **check_shape("points", points, "M 3"))
     check_shape("vertex_normals", vertex_normals, "V 3", **check_shape("vertices", vertices, "V 3"))
@@ -74,17 +69,13 @@ def _row_medians(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SkinVote:
-    """Which body vertices are bare: ``bare (V,)`` bool; ``share (V,)`` in [0, 1], the smoothed vote behind it.
+    """Which body vertices are ``bare (V,)``, bool, and what share of the scans shows each or its cover, ``seen (V,)``.
 
-    ``seen (V,)`` share of the scans that show a vertex or what covers it; ``offset (V,)`` metres, median over those
-    scans; ``noise`` metres, standard deviation of one scan's offset on bare skin; ``spread`` metres, that of the
-    median over scans.
+    Standard deviations on bare skin, metres: ``noise`` of one scan's offset, ``spread`` of the median over scans.
     """
 
     bare: np.ndarray
-    share: np.ndarray
     seen: np.ndarray
-    offset: np.ndarray
     noise: float
     spread: float
 
@@ -102,10 +93,8 @@ def estimate_noise(offsets: np.ndarray, template: Template) -> float:
     """Standard deviation of offsets ``(S, V)`` on bare skin, metres: of the barest of head, left and right hand.
 
     From a quantile of the absolute offsets, so that hair, a cuff or a beard on a fifth of the part do not count. For a
-    body whose joints have other names, from the tenth of the vertices that lie closest to their scans.
-
-    Raises:
-        AvatarError: when no scan shows any vertex of the body.
+    body whose joints have other names, from the tenth of the vertices that lie closest to their scans. Raises
+    `AvatarError` when no scan shows any vertex of the body.
     """
     check_shape("offsets", offsets, "S V", V=len(template.vertices))
     sizes = np.abs(offsets)
@@ -124,21 +113,13 @@ def estimate_noise(offsets: np.ndarray, template: Template) -> float:
 
 
 def vote_skin(offsets: np.ndarray, template: Template, length: float, smallest: float) -> SkinVote:
-    """Bare skin by the vote of all scans, smoothed over the body.
+    """Bare skin by the vote of all scans' ``offsets (S, V)`` from `body_offsets`, smoothed over the body.
 
     A vertex votes bare where the median of its offsets over the scans is within three standard deviations of what such
-    medians are on head and hands. Votes are smoothed over the body (`smooth_votes`), so that vertices that no scan
-    shows (eyelids, armpits, between fingers) go with those around them and borders are clean; then islands smaller
-    than ``smallest`` take their surroundings' label.
-
-    Args:
-        offsets: ``(S, V)`` of `body_offsets`, a row a scan.
-        template: the body at rest.
-        length: metres over which votes are smoothed.
-        smallest: square metres; smaller islands of either label are overruled.
-
-    Raises:
-        AvatarError: when no scan shows any vertex of the body.
+    medians are on head and hands. Votes are smoothed over ``length`` metres of the body (`smooth_votes`), so that
+    vertices that no scan shows (eyelids, armpits, between fingers) go with those around them and borders are clean;
+    then islands below ``smallest`` square metres take their surroundings' label. Raises `AvatarError` when no scan
+    shows any vertex of the body.
     """
     noise = estimate_noise(offsets, template)
     shown = np.isfinite(offsets)
@@ -150,17 +131,12 @@ def vote_skin(offsets: np.ndarray, template: Template, length: float, smallest: 
     share = smooth_votes(vertices, faces, votes, seen, length)
     share = np.where(np.isnan(share), 1.0, share)  # parts that no scan shows (eyeballs, teeth) are the body's
     bare = without_islands(faces, share > 0.5, vertex_areas(vertices, faces), smallest)
-    return SkinVote(bare, share, seen, median, noise, spread)
+    return SkinVote(bare, seen, noise, spread)
 
 
 def without_islands(faces: np.ndarray, labels: np.ndarray, areas: np.ndarray, smallest: float) -> np.ndarray:
     """Labels ``(V,)`` bool whose connected islands below an area take the other label; the largest of each stays.
-
-    Args:
-        faces: ``(F, 3)``.
-        labels: ``(V,)`` bool.
-        areas: ``(V,)`` square metres a vertex.
-        smallest: square metres.
+    ``areas (V,)`` and ``smallest`` are square metres.
     """
     labels = labels.copy()
     for value in (False, True):
@@ -177,14 +153,7 @@ def label_points(
     points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, vertex_normals: np.ndarray, vote: SkinVote
 ) -> np.ndarray:
     """Which points ``(M,)`` of a posed scan are garment: those that do not lie on bare skin within three standard
-    deviations of one scan's noise, by the majority of the points around each.
-
-    Args:
-        points: ``(M, 3)`` metres.
-        normals: ``(M, 3)`` unit.
-        vertices: ``(V, 3)`` the body in the scan's pose.
-        vertex_normals: ``(V, 3)`` unit.
-        vote: which vertices are bare.
+    deviations of one scan's noise, by the majority of the points around each. Arguments as for `body_offsets`.
     """
     _, owner = build_tree(vertices).query(points)
     middle = normals + vertex_normals[owner]

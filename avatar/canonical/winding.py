@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy.fft
+import trimesh
 from scipy.ndimage import map_coordinates
 
 from avatar.checks import AvatarError, check_finite, check_shape, require
@@ -61,11 +62,8 @@ class WindingGrid:
     def solve(self, blur: float) -> Winding:
         """The mean winding number of the scans added, and their mean area vectors, blurred by a Gaussian.
 
-        Args:
-            blur: standard deviation, metres; at least about the distance between a scan's points where scans are few.
-
-        Raises:
-            AvatarError: when no scan was added.
+        ``blur`` is its standard deviation, metres: where scans are few, at least about the distance between a scan's
+        points. Raises `AvatarError` when no scan was added.
         """
         if not self.scans:
             raise AvatarError("scans: expected at least one canonical scan, got none.")
@@ -94,9 +92,7 @@ class WindingGrid:
 
 def grid_around(low: np.ndarray, high: np.ndarray, spacing: float, margin: float = MARGIN) -> WindingGrid:
     """An empty grid that holds a box ``(3,)``, ``(3,)`` and a margin around it, metres.
-
-    Raises:
-        AvatarError: when the grid would have more than 64 million nodes.
+    Raises `AvatarError` when it would have more than 64 million nodes.
     """
     shape = tuple(int(scipy.fft.next_fast_len(int(n), real=True)) for n in np.ceil((high - low + 2 * margin) / spacing))
     if np.prod(shape) > MAX_CELLS:
@@ -138,9 +134,7 @@ class Winding:
 
     def surface(self, level: float = 0.5) -> Mesh:
         """The closed surface where the winding number is ``level``, wound outwards.
-
-        Raises:
-            AvatarError: when there is none: the scans agree on no inside.
+        Raises `AvatarError` when there is none: the scans agree on no inside.
         """
         if not self.numbers.min() < level < self.numbers.max():
             raise AvatarError(
@@ -192,12 +186,9 @@ def area_vectors(scan: CanonicalScan) -> np.ndarray:
     check_finite("points", scan.points)
     if scan.faces is None:
         return scan.normals * disc_areas(scan.points)[:, None]
-    corners = scan.points.astype(np.float64)[scan.faces]
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 6
-    vectors = np.zeros((len(scan.points), 3))
-    for axis in range(3):
-        vectors[:, axis] = np.bincount(scan.faces.reshape(-1), crosses[:, axis].repeat(3), minlength=len(vectors))
-    return vectors
+    crosses = trimesh.triangles.cross(scan.points.astype(np.float64)[scan.faces]) / 6
+    corners = scan.faces.reshape(-1)
+    return np.stack([np.bincount(corners, axis.repeat(3), minlength=len(scan.points)) for axis in crosses.T], axis=1)
 
 
 def disc_areas(points: np.ndarray) -> np.ndarray:

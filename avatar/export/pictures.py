@@ -50,13 +50,16 @@ class Camera:
     center: tuple[float, float, float]  # in the middle of the picture, metres
     extent: float  # metres from its top to its bottom
     azimuth: float = 0.0  # degrees around the vertical, 0 before the person and 90 at the person's left
+    elevation: float = 0.0  # degrees above the horizon
     size: tuple[int, int] = (640, 960)  # pixels, width and height
 
     @property
     def axes(self) -> np.ndarray:
         """``(3, 3)`` rows right, up and towards the viewer, in the world."""
-        turn = np.radians(self.azimuth)
-        return np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+        turn, lift = np.radians([self.azimuth, self.elevation])
+        right = np.array([np.cos(turn), 0, -np.sin(turn)])
+        towards = np.array([np.sin(turn) * np.cos(lift), np.sin(lift), np.cos(turn) * np.cos(lift)])
+        return np.stack([right, np.cross(towards, right), towards])
 
     def seen_from(self, view: str) -> Camera:
         """The same framing from front, left, back, right, side (the left) or three_quarter."""

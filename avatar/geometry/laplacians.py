@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 from scipy.sparse import csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
@@ -16,14 +17,8 @@ STIFFEST = 1e3  # largest cotangent: triangles with an angle below 0.06 degrees 
 def cotangent_laplacian(vertices: np.ndarray, faces: np.ndarray, positive: bool = False) -> csr_matrix:
     """The positive semi-definite cotangent Laplacian ``(V, V)`` of a mesh, without the areas (dimensionless).
 
-    Args:
-        vertices: ``(V, 3)`` metres.
-        faces: ``(F, 3)``.
-        positive: take negative weights of edges across obtuse angles for zero, so that a maximum principle holds:
-            what is solved with the matrix stays within the bounds of its data.
-
-    Raises:
-        AvatarError: on wrong shapes or indices out of range.
+    ``positive`` takes negative weights of edges across obtuse angles for zero, so that a maximum principle holds: what
+    is solved with the matrix stays within the bounds of its data. Raises `AvatarError` on wrong shapes or indices.
     """
     check_faces(faces, check_shape("vertices", vertices, "V 3")["V"])
     corners = np.asarray(vertices, np.float64)[faces]
@@ -46,32 +41,19 @@ def cotangent_laplacian(vertices: np.ndarray, faces: np.ndarray, positive: bool 
 
 def vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The area ``(V,)`` that each vertex stands for, a third of the triangles around it, square metres."""
-    corners = np.asarray(vertices, np.float64)[faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    areas = trimesh.triangles.area(np.asarray(vertices, np.float64)[faces])
     return np.bincount(faces.reshape(-1), areas.repeat(3) / 3, minlength=len(vertices))
 
 
 def smooth_votes(
     vertices: np.ndarray, faces: np.ndarray, votes: np.ndarray, confidence: np.ndarray, length: float
 ) -> np.ndarray:
-    """Votes in [0, 1] smoothed over a surface; the line where they are 0.5 is a clean border between two labels.
+    """Votes ``(V,)`` in [0, 1] smoothed over a surface; where they are 0.5 is a clean border between two labels.
 
     Minimises ``sum area confidence (x - votes)^2 + length^2 sum cot (x_i - x_j)^2``: the relaxed form of a graph cut
-    (random walker, Grady 2006), solved by one sparse factorisation. Vertices without confidence take what their
-    neighbours have, by the shape of the surface; votes of patches narrower than about ``length`` are overruled.
-
-    Args:
-        vertices: ``(V, 3)`` metres.
-        faces: ``(F, 3)``.
-        votes: ``(V,)`` in [0, 1].
-        confidence: ``(V,)`` not negative; 0 where a vertex has no vote.
-        length: metres over which votes are averaged.
-
-    Returns:
-        ``(V,)`` in [0, 1]; NaN on connected parts without any vote.
-
-    Raises:
-        AvatarError: on wrong shapes or a negative length or confidence.
+    (random walker, Grady 2006), solved by one sparse factorisation. Vertices without ``confidence (V,)`` take what
+    their neighbours have, by the shape of the surface; votes of patches narrower than about ``length`` metres are
+    overruled. NaN on connected parts without any vote. Raises `AvatarError` on wrong shapes and negative values.
     """
     count = check_shape("vertices", vertices, "V 3")["V"]
     check_shape("votes", votes, "V", V=count)

@@ -19,42 +19,24 @@ KEYS = {
     "body_vertex": "int V",
     "covered": "bool V",
 }
+KINDS = {"vertices": np.float32, "faces": np.int32, "weights": np.float32, "body_vertex": np.int32, "covered": bool}
 
 
 def write_clothed_template(path: str | Path, clothed: ClothedTemplate) -> None:
-    """Writes a clothed template: float32 and int32, exact.
-
-    Raises:
-        AvatarError: for shapes that do not fit, non-finite numbers, weights that do not sum to 1, indices out of
-            range, covered vertices of the garment, or faces between skin and garment.
-    """
+    """Writes a clothed template: float32, int32 and bool. Raises `AvatarError` as `check_clothed_template` does."""
     check_clothed_template(clothed)
-    arrays = {
-        "format": np.array(FORMAT),
-        "vertices": np.asarray(clothed.vertices, np.float32),
-        "faces": np.asarray(clothed.faces, np.int32),
-        "weights": np.asarray(clothed.weights, np.float32),
-        "body_vertex": np.asarray(clothed.body_vertex, np.int32),
-        "covered": np.asarray(clothed.covered, bool),
-    }
-    write_arrays(Path(path), arrays)
+    arrays = {name: np.asarray(getattr(clothed, name), kind) for name, kind in KINDS.items()}
+    write_arrays(Path(path), {"format": np.array(FORMAT)} | arrays)
 
 
 def read_clothed_template(path: str | Path) -> ClothedTemplate:
     """Reads a clothed template, checked; indices come as int64.
-
-    Raises:
-        DataError: naming the file and what is wrong with it.
+    Raises `DataError` that names the file and what is wrong with it.
     """
     path = Path(path)
     stored = read_arrays(path, KEYS, version=FORMAT)
-    clothed = ClothedTemplate(
-        vertices=stored["vertices"],
-        faces=stored["faces"].astype(np.int64),
-        weights=stored["weights"],
-        body_vertex=stored["body_vertex"].astype(np.int64),
-        covered=stored["covered"],
-    )
+    indices = {name: stored[name].astype(np.int64) for name in ("faces", "body_vertex")}
+    clothed = ClothedTemplate(**stored | indices)
     try:
         check_clothed_template(clothed)
     except AvatarError as error:
@@ -66,7 +48,8 @@ def check_clothed_template(clothed: ClothedTemplate) -> None:
     """Refuses a clothed template that is not one.
 
     Raises:
-        AvatarError: naming the field, what was expected and what came.
+        AvatarError: for shapes that do not fit, non-finite numbers, weights that do not sum to 1, indices out of
+            range, covered vertices of the garment, or faces between skin and garment.
     """
     dims = check_shape("vertices", clothed.vertices, "V 3")
     check_shape("weights", clothed.weights, "V J", **dims)

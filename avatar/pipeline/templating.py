@@ -7,7 +7,6 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from avatar.canonical.refinement import pose_mesh
@@ -24,8 +23,8 @@ from avatar.export.pictures import (
 from avatar.io.clothed_templates import read_clothed_template
 from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
-from avatar.records import ClothedTemplate, Mesh, PointCloud, Template
-from avatar.runs.templating import GARMENT_COLOR, SKIN_COLOR, TemplateConfig, make_template, template_scans
+from avatar.records import Mesh, PointCloud, Template
+from avatar.runs.templating import TemplateConfig, make_template, skin_colors, template_scans
 
 log = logging.getLogger(__name__)
 PICTURE = (640, 640)
@@ -78,11 +77,6 @@ def draw_template(config: TemplateConfig, folder: Path) -> list[Path]:
         rows.append(row)
     save_picture(written[1], contact_sheet(rows, chosen, ("scan", "template", "scan, back", "template, back")))
     return written
-
-
-def skin_colors(clothed: ClothedTemplate) -> np.ndarray:
-    """Colours ``(V, 3)`` of skin and garment."""
-    return np.where((clothed.body_vertex >= 0)[:, None], SKIN_COLOR, GARMENT_COLOR)
 
 
 def head_camera(body: Template) -> Camera:

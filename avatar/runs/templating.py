@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
+from torch.utils.data import Subset
 
 from avatar.canonical.clothed import (
     FEW_SCANS,
@@ -27,7 +27,7 @@ from avatar.canonical.clothed import (
 from avatar.canonical.refinement import PosedPoints
 from avatar.canonical.scans import root_joint_transforms, to_root_frame
 from avatar.canonical.skin import SkinVote
-from avatar.checks import AvatarError, DataError, check_name
+from avatar.checks import AvatarError, DataError, check_name, require
 from avatar.data.batches import LruSequence
 from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
@@ -41,12 +41,12 @@ from avatar.io.meshes import write_mesh
 from avatar.io.npz import read_arrays, write_arrays, write_whole
 from avatar.methods.canonicalizer import WEIGHTS, canonicalizer_folder, find_field
 from avatar.progress import tracked
-from avatar.records import Mesh, Template
+from avatar.records import ClothedTemplate, Mesh, Template
 from avatar.settings import settings_to_dict
 
 SOURCE = ("avatar.canonical.clothed", "avatar.runs.templating")
 SKIN_COLOR, GARMENT_COLOR = (0.86, 0.66, 0.56), (0.42, 0.52, 0.72)
-SKIN_KEYS = {"bare": "bool V", "share": "float V", "seen": "float V", "offset": "float V", "numbers": "float N"}
+SKIN_KEYS = {"bare": "bool V", "seen": "float V"}
 MESH_KEYS = {"vertices": "float V 3", "faces": "int F 3"}
 
 
@@ -112,19 +112,6 @@ def hold_back(count: int, share: float) -> tuple[list[int], list[int]]:
     return [index for index in range(count) if index not in held], sorted(held)
 
 
-class Subsequence(Sequence):
-    """Some items of a sequence, by their indices."""
-
-    def __init__(self, items: Sequence, chosen: Sequence[int]):
-        self.items, self.chosen = items, chosen
-
-    def __len__(self) -> int:
-        return len(self.chosen)
-
-    def __getitem__(self, index: int) -> Any:
-        return self.items[self.chosen[index]]
-
-
 @prepared_process()
 def make_template(config: TemplateConfig) -> Path:
     """Makes an outfit's clothed template, or goes on with it; gives its folder, ``<canonicalizer's run>/template``.
@@ -134,8 +121,9 @@ def make_template(config: TemplateConfig) -> Path:
 
     Raises:
         DataError: without canonical scans, with the command that makes them.
-        AvatarError: when the scans do not make a surface.
+        AvatarError: when the scans do not make a surface, or without pyacvd.
     """
+    require("pyacvd")
     outfit = config.find_outfit()
     run = config.find_run(outfit)
     names, scans = template_scans(run, outfit)
@@ -143,7 +131,7 @@ def make_template(config: TemplateConfig) -> Path:
     with lock_folder(folder):
         write_whole(folder / "config.yaml", yaml.safe_dump(settings_to_dict(config), sort_keys=False).encode())
         made, held = hold_back(len(names), settings.held_back)
-        seen, measured = Subsequence(scans, made), Subsequence(scans, held)
+        seen, measured = Subset(scans, made), Subset(scans, held)
         files = {name: file_digest(run / "scans" / "train" / f"{name}.npz") for name in names}
         bodies = {name: outfit.digest("train", name) for name in names}
         field_file = run / f"{WEIGHTS}.safetensors"
@@ -151,12 +139,12 @@ def make_template(config: TemplateConfig) -> Path:
         plain = settings_to_dict(settings)
         key = keyed(SOURCE, scans=files, frames=bodies, field=learned, settings=plain)
         ledger = Ledger(folder)
-        vote = kept_skin(folder, ledger, key, lambda: find_skin(seen, template, settings, track_scans))
-        garment = kept_garment(folder, ledger, key, lambda: fuse_garment(seen, template, vote, settings, track_scans))
+        vote = kept_skin(folder, ledger, key, lambda: find_skin(seen, template, settings))
+        garment = kept_garment(folder, ledger, key, lambda: fuse_garment(seen, template, vote, settings))
         if not ledger.find("template", key):
             weighed = None
             if len(garment.mesh.faces):
-                points = [garment_of(scan, vote) for scan in track_scans(seen, "garment points")]
+                points = [garment_of(scan, vote) for scan in tracked(seen, "garment points", unit="scan")]
                 unseen = [garment_of(scan, vote) for scan in measured]
                 field_of = find_field(run, template)
                 weighed = weigh_garment(garment.mesh, template, field_of, points, unseen, settings)
@@ -164,11 +152,6 @@ def make_template(config: TemplateConfig) -> Path:
             written = [folder / name for name in ("template.npz", "template.ply", "report.json")]
             ledger.record("template", key, written)
     return folder
-
-
-def track_scans(scans: Sequence, what: str):
-    """Scans under a progress bar."""
-    return tracked(scans, what, unit="scan")
 
 
 def garment_of(scan: ScanInPose, vote: SkinVote) -> PosedPoints:
@@ -179,15 +162,13 @@ def garment_of(scan: ScanInPose, vote: SkinVote) -> PosedPoints:
 def kept_skin(folder: Path, ledger: Ledger, key: str, make: Callable[[], SkinVote]) -> SkinVote:
     """The vote for skin, from ``steps/skin.npz`` where it is there for this key."""
     path = folder / "steps" / "skin.npz"
-    if not ledger.find("skin", key):
+    note = ledger.find("skin", key)
+    if not note:
         vote = make()
-        arrays = {name: getattr(vote, name) for name in ("bare", "share", "seen")}
-        arrays["offset"] = np.nan_to_num(vote.offset, nan=-1.0)
-        write_arrays(path, arrays | {"numbers": np.array([vote.noise, vote.spread])})
-        ledger.record("skin", key, [path])
-    stored = read_arrays(path, SKIN_KEYS)
-    noise, spread = stored.pop("numbers").tolist()
-    return SkinVote(**stored, noise=noise, spread=spread)
+        write_arrays(path, {"bare": vote.bare, "seen": vote.seen})
+        note = {"noise": vote.noise, "spread": vote.spread}
+        ledger.record("skin", key, [path], note)
+    return SkinVote(**read_arrays(path, SKIN_KEYS), **note)
 
 
 def kept_garment(folder: Path, ledger: Ledger, key: str, make: Callable[[], Garment]) -> Garment:
@@ -197,10 +178,14 @@ def kept_garment(folder: Path, ledger: Ledger, key: str, make: Callable[[], Garm
     if not note:
         garment = make()
         write_arrays(path, {"vertices": garment.mesh.vertices, "faces": garment.mesh.faces})
-        note = {"filled": list(garment.filled), "dropped": list(garment.dropped)}
+        note = {"filled": garment.filled, "dropped": garment.dropped}
         ledger.record("garment", key, [path], note)
-    stored = read_arrays(path, MESH_KEYS)
-    return Garment(Mesh(stored["vertices"], stored["faces"]), tuple(note["filled"]), tuple(note["dropped"]))
+    return Garment(Mesh(**read_arrays(path, MESH_KEYS)), **note)
+
+
+def skin_colors(clothed: ClothedTemplate) -> np.ndarray:
+    """Colours ``(V, 3)`` of skin and garment."""
+    return np.where((clothed.body_vertex >= 0)[:, None], SKIN_COLOR, GARMENT_COLOR)
 
 
 def write_template_files(
@@ -231,6 +216,5 @@ def write_template_files(
         "settings": settings_to_dict(settings),
     }
     write_clothed_template(folder / "template.npz", clothed)
-    colors = np.where((clothed.body_vertex >= 0)[:, None], SKIN_COLOR, GARMENT_COLOR)
-    write_mesh(folder / "template.ply", Mesh(clothed.vertices, clothed.faces, colors))
+    write_mesh(folder / "template.ply", Mesh(clothed.vertices, clothed.faces, skin_colors(clothed)))
     write_whole(folder / "report.json", json.dumps(report, indent=1).encode())

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,7 +65,10 @@ def test_projection_of_known_points():
     np.testing.assert_allclose(project(camera, points), [[50, 100], [100, 100], [50, 0], [50, 100]])
     from_left = camera.seen_from("left")  # the person's left is +x: +z then points to the picture's left
     np.testing.assert_allclose(project(from_left, [[0, 1, 0.5]]), [[0, 100]])
-    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
+    from_below = replace(camera, elevation=-30.0)  # +z then points down
+    np.testing.assert_allclose(project(from_below, [[0, 1, 1], [0.5, 1, 0]]), [[50, 50], [100, 100]], atol=1e-9)
+    for view in (camera, from_left, replace(from_left, elevation=-30.0)):
+        np.testing.assert_allclose(view.axes @ view.axes.T, np.eye(3), atol=1e-12)
 
 
 def test_red_is_red_and_a_surface_has_no_holes():
