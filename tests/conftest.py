@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+from collections import Counter
 
 import pretended
 import pytest
@@ -39,6 +40,9 @@ def pytest_collection_modifyitems(items):
     run none.
     """
     items[:] = [item for item in items if bool(item.get_closest_marker("pretended")) == ON_PRETENDED]
+    if "PYTEST_XDIST_WORKER" in os.environ:  # long files first, so that all workers end at the same time
+        slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+        items.sort(key=lambda item: -slow[item.path])  # documented commands before all others
 
 
 @pytest.fixture(scope="session")
