@@ -157,14 +157,12 @@ def ball_query(centres: Tensor, points: Tensor, radius: float, k: int, ranks: Te
 
 
 def _ranked_ball_query(centres: Tensor, points: Tensor, radius: float, k: int, ranks: Tensor) -> Tensor:
-    groups = nearest(centres[None], points[None])[0, :, None].expand(-1, k).cpu().numpy().copy()
-    order = ranks.cpu().numpy()
+    groups, order = nearest(centres[None], points[None])[0, :, None].expand(-1, k).cpu().numpy().copy(), ranks.cpu()
     tree = build_tree(points.double().cpu().numpy())
     balls = tree.query_ball_point(centres.double().cpu().numpy(), radius, return_sorted=False)
     for group, ball in zip(groups, balls):
-        inside = np.asarray(ball, np.int64)
-        others = inside[inside != group[0]]
-        kept = others[order[others].argsort()[: k - 1]]
+        others = np.setdiff1d(np.asarray(ball, np.int64), group[:1], assume_unique=True)
+        kept = others[order.numpy()[others].argsort()[: k - 1]]
         group[1 : 1 + len(kept)] = kept
     return torch.from_numpy(groups).to(points.device)
 
