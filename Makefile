@@ -17,6 +17,7 @@ lint: setup-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# a file of tests to each of two processes, one thread each: two cores are then busy, and no threads wait for a core
+# a file of tests to each of two processes in the order of tests/conftest.py, one thread each: two cores are then busy, and
+# no threads wait for a core
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder

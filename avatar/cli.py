@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import gc
 import inspect
 import json
 import os
@@ -59,6 +60,7 @@ def run(name: str, verb: Verb | None = None) -> NoReturn:
     """
     for number in signal.SIGINT, signal.SIGTERM:  # until the verb listens itself
         signal.signal(number, leave_at_once(name))
+    gc.disable()  # until `collect_garbage`
     code: int | str | None = 0
     try:
         try:
@@ -71,7 +73,19 @@ def run(name: str, verb: Verb | None = None) -> NoReturn:
             raise
         code = invocation.PIPE_CLOSED
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done
+    gc.freeze()  # the interpreter's end looks at every object for garbage, which takes a second with torch's
     sys.exit(code)
+
+
+def collect_garbage() -> None:
+    """Turns garbage collection on, which `run` turns off while a verb is imported, once the verb's work begins.
+
+    Modules are no garbage, and looking at all of torch's objects again and again takes a quarter of the time of its
+    import. What has been imported is not looked at later either.
+    """
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
 
 
 def leave_at_once(verb: str) -> Callable[[int, FrameType | None], NoReturn]:
@@ -95,7 +109,9 @@ def start(name: str, verb: Verb) -> None:
 
             command(name, verb=verb)
         else:
-            resolve(verb.run)()
+            work = resolve(verb.run)
+            collect_garbage()
+            work()
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
         if package not in invocation.CORE:

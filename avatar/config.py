@@ -28,7 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from avatar.arguments import explain, help_text, refuse_code, text_options, tidy_arguments
 from avatar.checks import AvatarError, check_trained
-from avatar.cli import leave_at_once, refuse, silence_closed_streams
+from avatar.cli import collect_garbage, leave_at_once, refuse, silence_closed_streams
 from avatar.data.folders import outfit_folder
 from avatar.declared import declared, method_settings
 from avatar.environment import prepared_process
@@ -137,6 +137,7 @@ def conclude(name: str, verb: Verb, jobs: list[outcomes.Outcome]) -> int:
     finished = [job.settings for job in jobs if job.state == State.finished]
     if verb.then and finished:
         done = [settings_from_dict(resolve(verb.settings), settings) for settings in finished]
+        collect_garbage()  # where workers did the jobs
         try:
             report.info("%s: %s", name, resolve(verb.then)(done))
         except AvatarError as error:
@@ -174,6 +175,7 @@ def run_job(name: str, verb: Verb, config: DictConfig, journal: Path, parent: in
         leaving = (signal.SIGINT, signal.SIGTERM) if os.getpid() == parent else ()
         with listening(leave_at_once(name), leaving):
             settings, run = to_settings(resolve(verb.settings), config), resolve(verb.run)
+        collect_garbage()
         with leave_when_asked(), prepared_process():
             WORK.clear()
             started = time.monotonic()

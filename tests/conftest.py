@@ -1,7 +1,9 @@
 """Its place puts this folder on the path, so that tests import the slow truths as ``reference``."""
 
+import gc
 import os
 import shutil
+from collections import Counter
 
 import pretended
 import pytest
@@ -22,6 +24,15 @@ CHROMIUM_FLAGS = (
 )
 
 
+gc.disable()  # until all tests are collected: looking for garbage among modules is a tenth of the tests' time
+
+
+def pytest_collection_finish():
+    """What is imported by now is not looked at for garbage again."""
+    gc.freeze()
+    gc.enable()
+
+
 def pytest_collection_modifyitems(items):
     """Tests on the pretended accelerator run in a process of their own, and nothing else runs there.
 
@@ -29,6 +40,9 @@ def pytest_collection_modifyitems(items):
     run none.
     """
     items[:] = [item for item in items if bool(item.get_closest_marker("pretended")) == ON_PRETENDED]
+    if "PYTEST_XDIST_WORKER" in os.environ:  # long files first, so that all workers end at the same time
+        slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+        items.sort(key=lambda item: -slow[item.path])  # documented commands before all others
 
 
 @pytest.fixture(scope="session")

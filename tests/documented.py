@@ -99,10 +99,11 @@ SHORT = {
     "check_reliability": ("only=[fuzz]", "files=50"),
 }
 
-# And fewer jobs of an experiment: test_configs.py composes them all.
+# And fewer jobs of an experiment, or of one with certain options: test_configs.py composes them all.
 FEWER = {
     "closet1": ("method=pop,closet", "outfit=[tee,skirt]"),
     "closet3": ("method=pop,closet", "outfit=jacket"),
+    "closet5 train.seed=0,1,2": ("method=pop,closet",),
     "closet4": ("method=scale_global,csf,closet_pointnext", "outfit=jacket"),
     "closet_pop": ("budget=steps", "outfit=skirt", "method=pop,closet", "train.seed=0"),
     "fractions": ("method=static", "split.train_fraction=1.0,0.5"),
@@ -237,8 +238,9 @@ def verb_of(text: str) -> str:
 
 def shortened(text: str) -> str:
     """A command with the options of its verb that make less work, in place of those printed."""
-    named = re.search(r" experiment=(\w+)", text)
-    options = [*SHORT.get(verb_of(text), ()), *FEWER.get(named.group(1) if named else "", ())]
+    options = list(SHORT.get(verb_of(text), ()))
+    for name, fewer in FEWER.items():
+        options += fewer if f" experiment={name} " in f"{text} " else ()
     if text.startswith("torchrun"):  # a whole number of frames a process, and so another run than that of one process
         options = [*(option for option in options if option != "train.batch=1"), "train.batch=4", "name=team"]
     keys = {option.partition("=")[0] for option in options}
@@ -328,12 +330,12 @@ class Starter:
 
 
 def copy_program(folder: Path) -> Path:
-    """A copy of the program whose embedded sample has six train and two test frames an outfit."""
+    """A copy of the program whose embedded sample has six train frames an outfit and two of each other split."""
     for name in ("avatar", "conf", "tools"):
         shutil.copytree(ROOT / name, folder / name)
     shutil.copy2(ROOT / "setup.cfg", folder)  # by which a checkout is known
     for outfit in (folder / "avatar/assets/sample").iterdir():
-        for split, count in (("train", 6), ("test", 2)):
+        for split, count in (("train", 6), ("test", 2), ("interpolation", 2)):
             paths = sorted((outfit / split).glob("*.npz"))
             for path in paths[count:]:
                 path.unlink()

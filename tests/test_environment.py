@@ -89,6 +89,41 @@ def test_every_verb_keeps_freed_memory_for_what_comes_next():
     assert thrown_away > 3 * 10_000 and kept < 1000
 
 
+@pytest.mark.parametrize("settings", ["avatar.pipeline.parameters:ParametersConfig", ""])
+def test_garbage_is_looked_for_while_a_verb_works_alone(settings):
+    """Not amid torch's import, and neither then nor at the end among the objects that it has made."""
+    code = (
+        "import atexit, gc, avatar.verbs\n"
+        "from avatar.cli import run\n"
+        "collections = []\n"
+        "gc.callbacks.append(lambda phase, facts: collections.append(facts))\n"
+        "def work(*settings):\n"
+        "    frozen, others = gc.get_freeze_count(), len(gc.get_objects())\n"
+        "    print(len(collections), gc.isenabled(), 100 * frozen // (frozen + others))\n"
+        "    return []\n"
+        "def count(): print(len(gc.get_objects()))\n"
+        "atexit.register(count)\n"
+        "collections.clear()\n"
+        f"run('parameters', avatar.verbs.Verb('', '__main__:work', {settings!r}))"
+    )
+    collections, enabled, frozen, left = in_fresh_python(code).stdout.split()
+    assert (collections, enabled) == ("0", "True") and int(frozen) > 95 and int(left) < 1000
+
+
+def test_garbage_is_looked_for_once_workers_have_done_the_jobs():
+    code = (
+        "import gc\n"
+        "from avatar.config import conclude\n"
+        "from avatar.pipeline.outcomes import Outcome\n"
+        "from avatar.verbs import Verb\n"
+        "def then(done): return print(gc.isenabled())\n"
+        "gc.disable()\n"
+        "verb = Verb('', '__main__:work', 'avatar.pipeline.parameters:ParametersConfig', '__main__:then')\n"
+        "conclude('parameters', verb, [Outcome(0, 'parameters', 'finished')])"
+    )
+    assert in_fresh_python(code).stdout == "True\n"
+
+
 X86 = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the switch of x86 processors")
 LEFT = (
     "import torch\n"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import hashlib
 import itertools
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +14,9 @@ from avatar.checks import AvatarError, check_shape
 from avatar.geometry.neighbours import ball_query, k_nearest
 from avatar.geometry.sparse import SparseRows, gather_sum
 from avatar.geometry.surface import farthest_points
+
+BUILT: dict[tuple, nn.ModuleList] = {}  # hierarchies by their points and sizes, the oldest first
+KEPT = 4  # as many of them
 
 
 @dataclass
@@ -90,13 +95,27 @@ def centre_rows(level: Level) -> FixedRows:
 def build_levels(positions: Tensor, config: HierarchyConfig) -> nn.ModuleList:
     """The levels of a hierarchy over constant points ``(V, 3)``, finest first; nested farthest-point subsets.
 
-    Raises `AvatarError` when the template has no more points than the finest level.
+    Each call gives modules of its own; the same points and sizes are searched once a process, as a run's network is
+    built again for predictions and scores. Raises `AvatarError` when the template has no more points than the finest
+    level.
     """
     count = check_shape("positions", positions, "V 3")["V"]
     if count <= config.points[0]:
         expected = f"a finest level below the template's {count} vertices"
         raise AvatarError(f"points: expected {expected}, got {config.points[0]}.")
-    levels, finer = nn.ModuleList(), positions.detach()
+    finer = positions.detach()
+    digest = hashlib.sha256(finer.cpu().numpy().tobytes()).digest()
+    key = (digest, str(finer.dtype), str(finer.device), *astuple(config))
+    if key not in BUILT:
+        built = _search_levels(finer, config)
+        while len(BUILT) >= KEPT:
+            BUILT.pop(next(iter(BUILT)))
+        BUILT[key] = built
+    return copy.deepcopy(BUILT[key])
+
+
+def _search_levels(finer: Tensor, config: HierarchyConfig) -> nn.ModuleList:
+    levels = nn.ModuleList()
     order = farthest_points(finer, config.points[0])
     ranks = torch.arange(len(order), len(order) + len(finer), device=order.device)  # of the others, as they come
     ranks[order] = torch.arange(len(order), device=order.device)

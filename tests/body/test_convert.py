@@ -9,6 +9,7 @@ import sys
 import tracemalloc
 import types
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -261,27 +262,41 @@ def test_pickles_that_mean_to_exhaust_are_refused_in_little_memory(data, tmp_pat
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("compress", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix])
-@pytest.mark.parametrize(
-    ("key", "values"),
-    [
+def test_sparse_matrices_whose_entries_lie_elsewhere_are_refused(tmp_path):
+    """Each in a process of its own: scipy would read and write where they lead."""
+    elsewhere = [
         ("indptr", [0, 300_000_000, 0]),  # as many entries as there are none of
         ("indptr", [0, 5, -1]),
         ("indptr", [0, 2**40, 2**40]),
         ("indices", [0, 300_000_000]),
         ("indices", [0, -300_000_000]),
-    ],
-)
-def test_sparse_matrices_whose_entries_lie_elsewhere_are_refused(compress, key, values, tmp_path):
-    """In a process of its own: scipy would read and write where they lead."""
+    ]
     model = vars(random_model("smpl"))
-    matrix = compress(model["J_regressor"])
-    setattr(matrix, key, np.concatenate([values, getattr(matrix, key)[len(values) :]]).astype(np.int64))
-    (tmp_path / "model.pkl").write_bytes(pickle.dumps({**model, "J_regressor": matrix}))
-    code = "import sys; from avatar.body.smpl import convert_body_model; convert_body_model(*sys.argv[1:])"
-    line = [sys.executable, "-c", code, str(tmp_path / "model.pkl"), str(tmp_path / "plain.npz")]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 1 and "DataError" in done.stderr and "model.pkl" in done.stderr, done.stderr
+    for compress, (number, (key, values)) in product(
+        (scipy.sparse.csc_matrix, scipy.sparse.csr_matrix), enumerate(elsewhere)
+    ):
+        matrix = compress(model["J_regressor"])
+        setattr(matrix, key, np.concatenate([values, getattr(matrix, key)[len(values) :]]).astype(np.int64))
+        path = tmp_path / f"{matrix.format}_{number}.pkl"
+        path.write_bytes(pickle.dumps({**model, "J_regressor": matrix}))
+    code = (
+        "import os, sys\n"
+        "from avatar.body.smpl import convert_body_model\n"
+        "for path in sys.argv[1:]:\n"
+        "    child = os.fork()\n"
+        "    if not child:\n"
+        "        os.dup2(os.open(path + '.err', os.O_WRONLY | os.O_CREAT), 2)\n"
+        "        convert_body_model(path, path + '.npz')\n"
+        "        sys.exit(0)\n"
+        "    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)\n"
+    )
+    paths = sorted(map(str, tmp_path.glob("*.pkl")))
+    done = subprocess.run([sys.executable, "-c", code, *paths], capture_output=True, text=True, timeout=300)
+    codes = dict(zip(paths, map(int, done.stdout.split()), strict=True))
+    assert len(codes) == 10 and done.returncode == 0, done.stderr
+    for path, ended in codes.items():
+        said = Path(f"{path}.err").read_text()
+        assert ended == 1 and "DataError" in said and Path(path).name in said, (path, ended, said)
 
 
 def test_mutated_pickles_give_one_kind_of_error(tmp_path):

@@ -9,7 +9,9 @@ from spheres import sphere_template
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
+from avatar.geometry.surface import farthest_points
 from avatar.methods.closet import FULL_GARMENT_ENCODER, ClosetConfig
+from avatar.nn import hierarchy
 from avatar.nn.decoders import DecoderConfig, ShapeDecoder
 from avatar.nn.encoders import FeaturePropagation, PointNet2, PointNet2Config, SetAbstraction
 from avatar.nn.hierarchy import HierarchyConfig, build_levels
@@ -40,6 +42,30 @@ def test_levels_are_nested_and_interpolation_weights_follow_inverse_squares():
         weights = 1 / (distances[fine.up_ids[row]] + 1e-8)
         torch.testing.assert_close(fine.up_weights[row], weights / weights.sum())
     assert (coarse.up_weights.sum(dim=1) - 1).abs().max() < 1e-6
+
+
+def test_a_hierarchy_is_searched_once_and_every_call_has_its_own(monkeypatch):
+    searched = []
+
+    def search(points, count):
+        searched.append(count)
+        return farthest_points(points, count)
+
+    monkeypatch.setattr(hierarchy, "farthest_points", search)
+    monkeypatch.setattr(hierarchy, "BUILT", {})
+    points = sphere_template().vertices
+    first, second = build_levels(points, SIZES), build_levels(points.clone(), SIZES)
+    before = {name: buffer.clone() for name, buffer in second.named_buffers()}
+    for buffer in first.buffers():
+        buffer.zero_()
+    for levels in (second, build_levels(points, SIZES)):
+        assert all(torch.equal(before[name], buffer) for name, buffer in levels.named_buffers())
+    assert searched == [40]
+    others = [(points * 2, SIZES), (points.double(), SIZES), (points, replace(SIZES, spread=False))]
+    others += [(points, replace(SIZES, radii=(0.6, 1.5))), (points, replace(SIZES, neighbours=5))]
+    for place, sizes in others:
+        build_levels(place, sizes)
+    assert len(searched) == 1 + len(others) and len(hierarchy.BUILT) == hierarchy.KEPT
 
 
 def test_groups_are_the_balls_of_each_level_s_radius():
