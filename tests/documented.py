@@ -67,6 +67,7 @@ CANONICALIZER = (
     *("train.draw.scan=256", "train.draw.body=256", "train.draw.edges=64", "train.draw.pool=3000"),
     *("pictures=1", "scan.edge=0.04"),
 )
+CLOTHED = ("clothed.spacing=0.02", "clothed.edge=0.06", "clothed.refine.steps=2")
 TRAIN = (
     "train.steps=2",
     "train.batch=1",
@@ -85,12 +86,13 @@ SHORT = {
     "experiment": (
         *(*TRAIN, *PREDICT, "score.scan_points=1000", "compare.pictures=1", "compare.resamples=100"),
         *(f"canonicalizer.{option}" for option in CANONICALIZER),
+        *CLOTHED,
     ),
     "seams": ("points=2000",),
     "mesh": ("frames=1", "poisson.depth=6"),
     "report": ("frames=1",),
     "canonicalize": CANONICALIZER,
-    "template": ("pictures=1", "clothed.spacing=0.02", "clothed.edge=0.06", "clothed.refine.steps=2"),
+    "template": ("pictures=1", *CLOTHED),
     "demo": (
         *(*TRAIN, "points=2000", "score.scan_points=1000", "meshes=1", "static_share=1.0"),
         *(f"canonicalizer.{option}" for option in CANONICALIZER),
@@ -105,6 +107,7 @@ FEWER = {
     "closet3": ("method=pop,closet", "outfit=jacket"),
     "closet5 train.seed=0,1,2": ("method=pop,closet",),
     "closet4": ("method=scale_global,csf,closet_pointnext", "outfit=jacket"),
+    "clothes": ("outfit=skirt", "method=layered", "train.seed=0"),
     "closet_pop": ("budget=steps", "outfit=skirt", "method=pop,closet", "train.seed=0"),
     "fractions": ("method=static", "split.train_fraction=1.0,0.5"),
     "loose": ("method=closet,closet_learned",),
