@@ -49,7 +49,8 @@ LAYERS = {
 }
 SIBLINGS = 3  # the layer whose subpackages do not import each other
 FORBIDDEN = {("evaluation", "nn"), ("evaluation", "methods"), ("evaluation", "training")}
-AVATARS = ("closet", "pop", "scale", "scanimate")  # methods of avatars: each is known to its own file and the registry
+# Methods of avatars: each is known to its own file and the registry.
+AVATARS = ("closet", "pop", "scale", "scanimate", "layered")
 ONLY_IN = {  # package: the subpackages that may name it at all
     "hydra": {"config", "arguments"},
     "omegaconf": {"config", "arguments"},
