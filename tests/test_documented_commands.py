@@ -53,6 +53,7 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         f"python tools/predict.py run={FIRST} motion=walk.npz",
         "python tools/train.py outfit=dress method=pop",
         "python tools/canonicalize.py dataset=sample outfit=dress",
+        "python tools/template.py outfit=dress",
     ),
     (
         "python tools/experiment.py experiment=closet5",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from avatar.geometry.cloth import ClothMesh, bending, body_contact, edge_strain,
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import invert_rigid, transform_points
 from avatar.implicit.extraction import ExtractionConfig
-from avatar.invocation import command_line
+from avatar.invocation import command_line, option
 from avatar.io.clothed_templates import read_clothed_template
 from avatar.methods.base import CANONICALIZER, CLOTHED_TEMPLATE, SEED_STRIDE, TrainedAvatar
 from avatar.methods.canonicalizer import canonicalizer_folder
@@ -220,7 +221,9 @@ class Layered(PointMethod):
         path = canonicalizer_folder(run.runs_root, outfits[0], run.canonical) / "template" / "template.npz"
         if not path.is_file():
             where = [f"dataset={run.dataset}", f"outfit={run.outfit[0]}", f"canonical={run.canonical}"]
-            raise DataError(path, "expected a clothed template, there is none.", command_line("template", *where))
+            where += [] if run.runs_root == Path("runs") else [option("runs_root", run.runs_root)]
+            command = command_line("template", *where)
+            raise DataError(path, "expected a clothed template, there is none.", f"Make it: {command}")
         return LayeredAvatar(template, read_clothed_template(path), settings)
 
     def untrained(self, settings: LayeredConfig, template: Template) -> nn.Module:
