@@ -183,7 +183,7 @@ def run(tiny_folder, tiny_outfit, tmp_path_factory) -> RunConfig:
         body_vertex=np.concatenate([skin, np.full(len(top), -1)]),
         covered=np.zeros(len(skin) + len(top), bool),
     )
-    train = quick_training(steps=40, points=2000, scan_points=2000, validate_every=20, save_every=20)
+    train = quick_training(steps=100, points=2000, scan_points=2000, validate_every=50, save_every=50)
     train = replace(train, schedule=Schedule.constant, loss=replace(train.loss, normal_start=0.0))  # no end to see
     choice = MethodChoice("layered", "layered", SETTINGS)
     where = {"dataset": tiny_folder.parent.name, "outfit": (tiny_folder.name,), "data_root": tiny_folder.parents[1]}
@@ -238,8 +238,8 @@ def test_it_comes_nearer_than_its_template_and_resumes_to_the_bit(run, tiny_outf
     for decoder in (template.garment_decoder, template.pose_decoder):
         torch.nn.init.zeros_(decoder.offset_branch[-1].weight)
         torch.nn.init.zeros_(decoder.offset_branch[-1].bias)
-    assert error(avatar.model) < 0.9 * error(template)
-    moved = replace(run, name="parts", train=replace(run.train, steps=20))
+    assert error(avatar.model) < 0.6 * error(template)  # measured: 0.48 of it
+    moved = replace(run, name="parts", train=replace(run.train, steps=50))
     train_run(moved)
     folder = train_run(replace(moved, train=run.train))
     assert (folder / "avatar.safetensors").read_bytes() == (whole / "avatar.safetensors").read_bytes()
