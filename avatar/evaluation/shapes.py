@@ -30,18 +30,23 @@ def crossing_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     longest = LONG * max(float(np.median(edges)), 1e-9)
     corners, whole, centres, reach = cut_triangles(vertices, faces, longest)
-    tree = build_tree(centres)
-    for rows in np.array_split(np.arange(len(corners)), len(corners) * 64 // PAIRS + 1):
-        found = tree.query_ball_point(centres[rows], reach[rows] + reach.max())
-        first = np.repeat(rows, [len(ids) for ids in found])
-        second = np.concatenate(found).astype(np.int64)
-        alike = (faces[whole[first]][:, :, None] == faces[whole[second]][:, None]).any(axis=(1, 2))
-        boxes = (corners[first].min(axis=1) <= corners[second].max(axis=1)) & (
-            corners[second].min(axis=1) <= corners[first].max(axis=1)
-        )
-        first, second = (ids[~alike & boxes.all(axis=1)] for ids in (first, second))
-        hit = edges_cut(corners[first], corners[second])
-        crossing[whole[first[hit]]] = crossing[whole[second[hit]]] = True
+    sizes = np.floor(np.log2(np.maximum(reach, 1e-12)))
+    for size in np.unique(sizes):  # each triangle meets those of its size and smaller ones, which lie near it
+        alike, larger = np.flatnonzero(sizes == size), np.flatnonzero(sizes >= size)
+        tree, bound = build_tree(centres[alike]), reach[alike].max()
+        for rows in np.array_split(larger, len(larger) * 64 // PAIRS + 1):
+            found = tree.query_ball_point(centres[rows], reach[rows] + bound)
+            first = np.repeat(rows, [len(ids) for ids in found])
+            second = alike[np.concatenate(found).astype(np.int64)]
+            once = (sizes[first] > size) | (first < second)
+            first, second = first[once], second[once]
+            joined = (faces[whole[first]][:, :, None] == faces[whole[second]][:, None]).any(axis=(1, 2))
+            boxes = (corners[first].min(axis=1) <= corners[second].max(axis=1)) & (
+                corners[second].min(axis=1) <= corners[first].max(axis=1)
+            )
+            first, second = (ids[~joined & boxes.all(axis=1)] for ids in (first, second))
+            hit = edges_cut(corners[first], corners[second]) | edges_cut(corners[second], corners[first])
+            crossing[whole[first[hit]]] = crossing[whole[second[hit]]] = True
     return crossing
 
 

@@ -59,7 +59,7 @@ class ClothConfig:
 
     laplacian: float = 4e5  # mean square of how offsets differ from the mean of their neighbours'
     strain: float = 1.0  # mean squared strain of edges, against the garment template's
-    bending: float = 10.0  # mean squared angle between faces: cloth is flat at rest
+    bending: float = 50.0  # mean squared angle between faces: cloth is flat at rest
     bent_rest: bool = False  # bending counts from the garment template's angles instead
     body_contact: float = 1e4  # mean square of what vertices lack of the gap to the body
     self_contact: float = 0.0  # the same between parts of the garment that are apart at rest
