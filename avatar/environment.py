@@ -58,11 +58,8 @@ def inspect_machine() -> list[Finding]:
 
 def inspect_package(name: str, use: str, needed: bool) -> Finding:
     """Imports a package in a fresh process, so that a crash or a missing shared library is only a finding."""
-    probe = [
-        sys.executable,
-        "-c",
-        f"import gc; gc.disable(); import {name}; gc.freeze()",
-    ]  # torch in three fifths of the time
+    quick = f"import gc; gc.disable(); import {name}; gc.freeze()"  # torch in three fifths of the time
+    probe = [sys.executable, "-c", quick]
     result = subprocess.run(probe, capture_output=True, text=True, timeout=120)
     if result.returncode:
         last = (result.stderr.strip().splitlines() or [f"the process died with code {result.returncode}"])[-1]

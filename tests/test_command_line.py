@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -21,6 +22,7 @@ from avatar.arguments import explain, tidy_arguments
 from avatar.checks import AvatarError
 from avatar.config import CONF, register
 from avatar.invocation import DISTRIBUTION, EXTRAS, install_line
+from avatar.pipeline.outcomes import find_ending
 from avatar.pipeline.surfaces import MeshConfig, mesh
 from avatar.progress import Progress
 from avatar.verbs import VERBS
@@ -215,6 +217,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on_and_a_second_leaves_at_once(folder):
 WORKERS = """
 import sys, time
 from pathlib import Path
+from types import SimpleNamespace
 from avatar.processes import in_workers
 from avatar.training.signals import leave_when_asked
 
@@ -358,3 +361,11 @@ def test_the_bar_on_a_terminal_ends_with_the_budget(monkeypatch):
             clock[0] += 1
             progress.advance()
         assert progress.bar.total == 100
+
+
+def test_after_a_demo_the_same_method_is_trained_longer_on_the_same_data(tmp_path):
+    (tmp_path / "summary.json").write_text('{"made": {}}')
+    chosen = {"method": SimpleNamespace(variant="layered"), "dataset": "open", "outfit": ("skirt",)}
+    config = SimpleNamespace(**chosen, data_root=Path("other"))
+    *_, line = find_ending("demo", config, tmp_path / "summary.json")[1]
+    assert line.endswith("train.py method=layered dataset=open outfit=skirt data_root=other train.minutes=30")

@@ -22,10 +22,10 @@ from avatar.geometry.transforms import invert_rigid, transform_points
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.invocation import command_line, option
 from avatar.io.clothed_templates import read_clothed_template
-from avatar.methods.base import CANONICALIZER, CLOTHED_TEMPLATE, SEED_STRIDE, TrainedAvatar
+from avatar.methods.base import CANONICALIZER, CLOTHED_TEMPLATE, TrainedAvatar
 from avatar.methods.canonicalizer import canonicalizer_folder
 from avatar.methods.closet import ClosetAvatar, ClosetConfig, Skinning
-from avatar.methods.points import PointMethod, PointTask, body_batch, check_count, join_clouds
+from avatar.methods.points import PointMethod, PointTask, body_batch, join_clouds, template_samples
 from avatar.methods.settings import FitConfig, RunConfig, Space
 from avatar.records import (
     Batch,
@@ -174,10 +174,6 @@ class LayeredTask(PointTask):
         super().__init__(model, *rest)
         self.cloth = ClothMesh.of_faces(model.garment_faces.cpu()).to(self.device)
 
-    def draw_points(self, key: int) -> SurfaceSamples:
-        generator = torch.Generator().manual_seed(self.config.seed * SEED_STRIDE + key)
-        return self.model.draw_samples(self.config.points, generator)
-
     def objective(self, prediction: Prediction, batch: Batch, progress: float) -> LossTerms:
         terms, config = super().objective(prediction, batch, progress), self.model.config.cloth
         if prediction.mesh is None:
@@ -210,9 +206,12 @@ class Layered(PointMethod):
 
     def check(self, run: RunConfig, settings: LayeredConfig) -> None:
         if len(run.outfit) != 1:
-            raise AvatarError(f"outfit: the layered method has one clothed template, got {len(run.outfit)} outfits.")
+            raise AvatarError(
+                f"outfit: expected one, with its template, got {len(run.outfit)}. Hint: train each alone."
+            )
         if run.space is not Space.posed or settings.skinning is not Skinning.body:
-            raise AvatarError("space, skinning: the layered method is posed by its clothed template; leave them out.")
+            got = f"{run.space.value} and {settings.skinning.value}"
+            raise AvatarError(f"space, skinning: expected posed and body for layered, got {got}. Hint: leave them out.")
 
     def needs(self, run: RunConfig, settings: LayeredConfig) -> frozenset[str]:
         return frozenset({CANONICALIZER, CLOTHED_TEMPLATE})
@@ -224,7 +223,10 @@ class Layered(PointMethod):
             where += [] if run.runs_root == Path("runs") else [option("runs_root", run.runs_root)]
             command = command_line("template", *where)
             raise DataError(path, "expected a clothed template, there is none.", f"Make it: {command}")
-        return LayeredAvatar(template, read_clothed_template(path), settings)
+        clothed = read_clothed_template(path)
+        if not clothed.garment_faces.any():
+            raise DataError(path, "expected a garment, got skin alone.", "Train method=closet on this outfit.")
+        return LayeredAvatar(template, clothed, settings)
 
     def untrained(self, settings: LayeredConfig, template: Template) -> nn.Module:
         arrays = {name: getattr(template, name).numpy() for name in ("vertices", "faces", "weights")}
@@ -236,8 +238,7 @@ class Layered(PointMethod):
         return LayeredAvatar(template, clothed_template(weights), settings)
 
     def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
-        check_count(points)
-        samples = avatar.model.draw_samples(points, torch.Generator().manual_seed(0))
+        samples = template_samples(avatar, points)
         return lambda body: self.surface(avatar, body, samples)
 
     @torch.no_grad()
@@ -257,15 +258,13 @@ class Layered(PointMethod):
         if not avatar.settings.template:
             return None
         model = avatar.model
-        samples = model.draw_samples(points, torch.Generator().manual_seed(0))
+        samples = template_samples(avatar, points).to(model.vertices.device)
         if body is not None:
             return self.surface(avatar, body, samples, wrinkles=False).cloud
         found = model.garment_template(0, model.garment_vertices)
         mesh = torch.cat([model.clothed_vertices[: model.skin], found.points[0]])
-        normals = interpolate(vertex_normals(mesh, model.clothed_faces), samples.to(mesh.device))
-        return join_clouds(
-            [replace(found, points=interpolate(mesh, samples.to(mesh.device))[None], normals=normals[None])]
-        )
+        normals = normalize(interpolate(vertex_normals(mesh, model.clothed_faces), samples), dim=-1, eps=1e-20)
+        return join_clouds([replace(found, points=interpolate(mesh, samples)[None], normals=normals[None])])
 
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         problem = "run: expected a method whose garment is a code alone, got layered, with a template of its own."

@@ -51,8 +51,11 @@ def check_count(points: int) -> None:
 def draw_samples(model: nn.Module, template: Template, points: int, generator: torch.Generator) -> SurfaceSamples:
     """Where on the body a network predicts: evenly by area, or at about as many points of its own.
 
-    A network on UV maps has the pixels or patches of its grid (``template_samples(points)``).
+    A network on UV maps has the pixels or patches of its grid (``template_samples(points)``); one with a surface of its
+    own draws from that (``draw_samples(points, generator)``).
     """
+    if hasattr(model, "draw_samples"):
+        return model.draw_samples(points, generator)
     own = getattr(model, "template_samples", None)
     samples = own(points) if own else None
     return sample_surface(template.vertices, template.faces, points, generator) if samples is None else samples

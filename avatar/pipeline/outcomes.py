@@ -72,7 +72,8 @@ def find_ending(verb: str, config: Any, result: Any) -> tuple[list[Path], list[s
             made = json.loads(result.read_text())["made"].values()
             paths = [Path(path) for listed in made for path in ([listed] if isinstance(listed, str) else listed)]
             activation = [activation_line()] if interpreter() != "python" else []
-            longer = command_line("train", f"outfit={config.outfit[0]}", "train.minutes=30")
+            what = [f"method={config.method.variant}", f"dataset={config.dataset}", f"outfit={config.outfit[0]}"]
+            longer = command_line("train", *what, *data_root(config.data_root), "train.minutes=30")
             return [*paths, result], [*filter(None, activation), longer]
     return result if isinstance(result, list) else [result], []
 

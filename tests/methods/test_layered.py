@@ -156,7 +156,7 @@ def test_the_heading_frame_sees_the_tilt_that_the_root_frame_does_not():
 def test_runs_it_cannot_train_are_refused():
     method, run = find_method("layered"), RunConfig(method=MethodChoice("layered", "layered"))
     method.check(run, LayeredConfig())
-    with pytest.raises(AvatarError, match="one clothed template, got 2"):
+    with pytest.raises(AvatarError, match=r"outfit: expected one, .*got 2"):
         method.check(replace(run, outfit=("tee", "dress")), LayeredConfig())
     with pytest.raises(AvatarError, match="space, skinning"):
         method.check(replace(run, space=Space.canonical), LayeredConfig())
@@ -195,6 +195,12 @@ def run(tiny_folder, tiny_outfit, tmp_path_factory) -> RunConfig:
     (folder / "config.yaml").write_text(f"{{dataset: {tiny_outfit.dataset}, outfit: {tiny_outfit.name}}}")
     write_template(folder / "template.npz", template)
     with pytest.raises(DataError, match=r"template\.npz.*tools/template\.py"):
+        train_run(config)
+    bare = clothed.body_vertex >= 0
+    parts = {name: getattr(clothed, name)[bare] for name in ("vertices", "weights", "body_vertex", "covered")}
+    skin_alone = ClothedTemplate(faces=clothed.faces[~clothed.garment_faces], **parts)
+    write_clothed_template(folder / "template" / "template.npz", skin_alone)
+    with pytest.raises(DataError, match=r"template\.npz.*expected a garment, got skin alone"):
         train_run(config)
     write_clothed_template(folder / "template" / "template.npz", clothed)
     return config
