@@ -123,6 +123,12 @@ class ClothedTemplate:
         return (self.body_vertex[self.faces] < 0).all(axis=1)
 
     @property
+    def garment(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The garment alone: ``vertices (G, 3)``, ``faces (F', 3)``, ``weights (G, J)``; skin comes before it."""
+        skin = int((self.body_vertex >= 0).sum())
+        return self.vertices[skin:], self.faces[self.garment_faces] - skin, self.weights[skin:]
+
+    @property
     def visible_faces(self) -> np.ndarray:
         """Which faces ``(F,)`` are garment or bare skin, bool: those without a covered vertex."""
         return ~self.covered[self.faces].any(axis=1)
@@ -166,6 +172,7 @@ class Batch(Tensors):
     names: tuple[str, ...]
     canonical: bool = False
     step_outfits: Tensor | None = None  # (O,) of the whole step, ascending, where this is one process's share of it
+    frame_ids: Tensor | None = None  # (B,) int64 index into the run's training frames, their mirror images behind them
 
     @property
     def outfits(self) -> Tensor:

@@ -108,7 +108,8 @@ class FrameDataset:
         body = {name: getattr(frame.body, name) for name in BODY_FIELDS}
         arrays = body | {"scan_points": frame.scan.points[chosen], "scan_normals": frame.scan.normals[chosen]}
         tensors = {key: torch.from_numpy(np.ascontiguousarray(a, np.float32))[None] for key, a in arrays.items()}
-        return Batch(**tensors, outfit_ids=torch.tensor([where.outfit]), names=(where.name,))
+        ids = {"outfit_ids": torch.tensor([where.outfit]), "frame_ids": torch.tensor([index])}
+        return Batch(**tensors, **ids, names=(where.name,))
 
     def frame(self, index: int) -> Frame:
         """A frame, from memory where it is kept."""

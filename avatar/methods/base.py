@@ -71,6 +71,9 @@ class Task(ABC):
         """Inputs of the validation frames, always the same; none by default."""
         return ()
 
+    def settle(self) -> None:  # noqa: B027 (nothing to settle by default)
+        """Brings what follows from the weights, but is not trained, up to date; before each validation and the end."""
+
     def log_values(self, terms: LossTerms) -> dict[str, float]:
         """The objective and every raw term, as the log shows them."""
         raw = {name: float(value.detach()) for name, value in terms.raw.items()}

@@ -15,7 +15,9 @@ from torch.nn.functional import normalize
 
 from avatar.body.skinning import skin_transforms
 from avatar.checks import AvatarError, DataError, check_range
+from avatar.data.batches import ACROSS, mirror_map
 from avatar.data.outfits import Outfit
+from avatar.data.splits import split_outfit
 from avatar.geometry.cloth import ClothMesh, bending, body_contact, edge_strain, self_contact
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import invert_rigid, transform_points
@@ -27,6 +29,8 @@ from avatar.methods.canonicalizer import canonicalizer_folder
 from avatar.methods.closet import ClosetAvatar, ClosetConfig, Skinning
 from avatar.methods.points import PointMethod, PointTask, body_batch, join_clouds, template_samples
 from avatar.methods.settings import FitConfig, RunConfig, Space
+from avatar.nn.decoders import Decoded, PoseFrame
+from avatar.nn.handles import ClothHandles, HandleLayout, pose_features
 from avatar.records import (
     Batch,
     BodyFit,
@@ -43,6 +47,7 @@ from avatar.records import (
 STATE = ("vertices", "faces", "weights", "body_vertex", "covered")  # of the clothed template, saved with the weights
 SKIN_SPACING = 0.03  # metres between the skin vertices that are encoded
 REST_APART = 0.04  # metres at rest from which on two places of a garment may not touch
+MIN_HANDLES = 20  # fewer cannot follow a garment
 TERMS = ("laplacian", "strain", "bending", "body_contact", "self_contact")
 
 
@@ -75,8 +80,14 @@ class LayeredConfig(ClosetConfig):
 
     code_skip: bool = True  # the decoders see the garment code itself beside its features
     free_offsets: bool = True  # an offset of each vertex, learned beside the code, is added to the template's
+    handles: int = 600  # places of the garment that a Gaussian process moves with the pose; 0 for none
     head: Head = Head.mesh
     cloth: ClothConfig = field(default_factory=ClothConfig)
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.handles and self.handles < MIN_HANDLES:
+            raise AvatarError(f"handles: expected 0 for none, or at least {MIN_HANDLES}, got {self.handles}.")
 
 
 class LayeredAvatar(ClosetAvatar):
@@ -87,7 +98,9 @@ class LayeredAvatar(ClosetAvatar):
     them, skin vertices `SKIN_SPACING` apart, of which a body has many more in face and hands.
     """
 
-    def __init__(self, template: Template, clothed: ClothedTemplate, config: LayeredConfig):
+    def __init__(
+        self, template: Template, clothed: ClothedTemplate, config: LayeredConfig, handles: ClothHandles | None = None
+    ):
         """Builds the network on the body at rest and a clothed template, whose skin vertices come first."""
         skin = int((clothed.body_vertex >= 0).sum())
         cells = np.floor(clothed.vertices[:skin] / SKIN_SPACING)
@@ -105,6 +118,7 @@ class LayeredAvatar(ClosetAvatar):
         constants["shown_faces"] = torch.from_numpy(np.flatnonzero(clothed.visible_faces))
         for name, value in constants.items():
             self.register_buffer(name, value.clone(), persistent=False)
+        self.handles = handles
         self.skin, self.garment_count = skin, len(clothed.vertices) - skin
         if config.head is Head.mesh:  # normals are those of the mesh
             for decoder in (getattr(self, "garment_decoder", None), self.pose_decoder):
@@ -133,6 +147,19 @@ class LayeredAvatar(ClosetAvatar):
         vertices = whole[:, self.seen]
         seen = transform_points(invert_rigid(batch.joint_transforms[:, :1]), vertices)
         return replace(batch, vertices=vertices, vertex_transforms=transforms, pose_vertices=seen), whole
+
+    def start(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool) -> Decoded:
+        """As `TemplateNetwork.start`, with the offsets of the handles: a training frame's own, or those of its pose."""
+        bare = self.bare_body(samples)
+        if self.handles is None or not wrinkles:
+            return bare
+        with torch.autocast(bare.offsets.device.type, enabled=False):
+            if self.training:
+                moved = self.handles(batch.frame_ids)
+            else:
+                moved = self.handles.predict(handle_poses(batch.joint_transforms, self.config))
+            offsets = interpolate(moved, samples) / self.config.offset_scale
+        return Decoded(offsets, bare.normals)
 
     def forward(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool = True) -> Prediction:
         """As `TemplateNetwork.forward`, at points of the clothed template.
@@ -165,6 +192,11 @@ def clothed_template(state: Mapping[str, Tensor]) -> ClothedTemplate:
     return ClothedTemplate(**{name: state[f"clothed_{name}"].cpu().numpy() for name in STATE})
 
 
+def handle_poses(joint_transforms: Tensor, config: LayeredConfig) -> Tensor:
+    """What the handles follow of joint transforms ``(B, J, 4, 4)``: with gravity in the heading frame."""
+    return pose_features(joint_transforms, gravity=config.pose_frame is PoseFrame.heading)
+
+
 class LayeredTask(PointTask):
     """Training on points of the clothed template's visible surface, with the terms of its mesh."""
 
@@ -173,6 +205,10 @@ class LayeredTask(PointTask):
     def __init__(self, model: LayeredAvatar, *rest: Any):
         super().__init__(model, *rest)
         self.cloth = ClothMesh.of_faces(model.garment_faces.cpu()).to(self.device)
+
+    def settle(self) -> None:
+        if self.model.handles is not None:
+            self.model.handles.fit(self.config.mirror)
 
     def objective(self, prediction: Prediction, batch: Batch, progress: float) -> LossTerms:
         terms, config = super().objective(prediction, batch, progress), self.model.config.cloth
@@ -202,7 +238,7 @@ class Layered(PointMethod):
     task = LayeredTask
     on_body = False
     makes_meshes = True
-    static: ClassVar[Mapping[str, Any]] = {"pose": False}
+    static: ClassVar[Mapping[str, Any]] = {"pose": False, "handles": 0}
 
     def check(self, run: RunConfig, settings: LayeredConfig) -> None:
         if len(run.outfit) != 1:
@@ -226,7 +262,18 @@ class Layered(PointMethod):
         clothed = read_clothed_template(path)
         if not clothed.garment_faces.any():
             raise DataError(path, "expected a garment, got skin alone.", "Train method=closet on this outfit.")
-        return LayeredAvatar(template, clothed, settings)
+        handles = None
+        if settings.handles:
+            frames = split_outfit(outfits[0], run.split).train
+            bodies = [outfits[0].load_body("train", name).joint_transforms for name in frames]
+            transforms = torch.as_tensor(np.stack(bodies), dtype=torch.float32)
+            if run.train.mirror:
+                joints = mirror_map(template).joints
+                transforms = torch.cat([transforms, ACROSS @ transforms[:, joints] @ ACROSS])
+            garment = clothed.garment
+            layout = HandleLayout.on_mesh(*map(torch.from_numpy, garment), settings.handles)
+            handles = ClothHandles(layout, handle_poses(transforms, settings))
+        return LayeredAvatar(template, clothed, settings, handles)
 
     def untrained(self, settings: LayeredConfig, template: Template) -> nn.Module:
         arrays = {name: getattr(template, name).numpy() for name in ("vertices", "faces", "weights")}
@@ -235,7 +282,11 @@ class Layered(PointMethod):
         return LayeredAvatar(template, clothed, settings)
 
     def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
-        return LayeredAvatar(template, clothed_template(weights), settings)
+        handles = None
+        if settings.handles:
+            layout = HandleLayout(*(weights[f"handles.{name}"] for name in ("ids", "shares", "groups")))
+            handles = ClothHandles(layout, weights["handles.poses"])
+        return LayeredAvatar(template, clothed_template(weights), settings, handles)
 
     def predictor(self, avatar: TrainedAvatar, outfit: str, points: int, surface: ExtractionConfig) -> Callable:
         samples = template_samples(avatar, points)

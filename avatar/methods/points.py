@@ -171,7 +171,9 @@ class PointMethod(Method):
             batch = replace(batch, canonical=canonical)
             if symmetry is None:
                 return batch
-            return mirror_batch(batch, mirror_coins(train.seed, step, size)[shard], symmetry)
+            coins = mirror_coins(train.seed, step, size)[shard]
+            batch = replace(batch, frame_ids=batch.frame_ids + coins * len(frames))
+            return mirror_batch(batch, coins, symmetry)
 
         def validation() -> Iterable[Batch]:
             batches = checks.ordered_batches(size) if checks else ()

@@ -160,7 +160,7 @@ class TemplateNetwork(nn.Module):
         if wrinkles and self.pose_decoder:
             pose = self.pose_features(batch, samples)
             parts.append(self.pose_decoder(torch.cat([pose, pick(garment, row)], dim=-1), places))
-        start, scale = self.bare_body(samples), self.config.offset_scale
+        start, scale = self.start(batch, samples, wrinkles), self.config.offset_scale
         scaled = [part.scaled(scale) for part in parts]
         local = sum(scaled, start.scaled(scale)) if self.scale_first else sum(parts, start).scaled(scale)
         both = len(parts) == 2  # alone they are the whole, not a part of it
@@ -175,6 +175,10 @@ class TemplateNetwork(nn.Module):
     def decode_garment(self, codes: Tensor, garment: Tensor, places: Tensor, samples: SurfaceSamples) -> Decoded:
         """The garment template of each outfit, ``(O, N, 3)``, from codes ``(O, ...)`` and features ``(O, N, C)``."""
         return self.garment_decoder(garment, places)
+
+    def start(self, batch: Batch, samples: SurfaceSamples, wrinkles: bool) -> Decoded:
+        """What decoders correct, ``(1, N, 3)`` or ``(B, N, 3)``: the bare body."""
+        return self.bare_body(samples)
 
     def bare_body(self, samples: SurfaceSamples) -> Decoded:
         """Zero offsets and the normals that decoders correct, ``(1, N, 3)``: the body's, or none."""

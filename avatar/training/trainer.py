@@ -186,6 +186,7 @@ class Trainer:
     def validate(self) -> dict[str, float]:
         """Mean loss terms over held-back frames at the end of training's schedule; empty without frames."""
         self.model.eval()
+        self.task.settle()
         sums: dict[str, float] = {}
         frames, end = 0, Position(len(self.task.stages) - 1, 1.0)
         for inputs in islice(self.task.held_back(), self.world.rank, None, self.world.size):

@@ -10,22 +10,34 @@ from tiny import SETTINGS, quick_training
 
 from avatar.body.packed import write_template
 from avatar.checks import AvatarError, DataError
+from avatar.data.splits import split_outfit
 from avatar.geometry.closest import closest_on_mesh
 from avatar.geometry.surface import interpolate, vertex_normals
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.clothed_templates import write_clothed_template
 from avatar.io.meshes import read_mesh
 from avatar.methods.base import Position
-from avatar.methods.layered import TERMS, ClothConfig, Head, LayeredAvatar, LayeredConfig, LayeredTask, clothed_template
+from avatar.methods.layered import (
+    TERMS,
+    ClothConfig,
+    Head,
+    LayeredAvatar,
+    LayeredConfig,
+    LayeredTask,
+    clothed_template,
+    handle_poses,
+)
 from avatar.methods.losses import LossConfig
 from avatar.methods.points import body_batch
 from avatar.methods.registry import find_method
 from avatar.methods.settings import MethodChoice, RunConfig, Schedule, Space, TrainConfig
 from avatar.nn.decoders import PoseFrame
+from avatar.nn.handles import ClothHandles, HandleLayout
 from avatar.records import ClothedTemplate
 from avatar.runs.prediction import predict_frames
 from avatar.runs.training import load_avatar
 from avatar.runs.training import train as train_run
+from avatar.settings import settings_from_dict
 
 
 def dressed_sphere() -> ClothedTemplate:
@@ -111,6 +123,50 @@ def test_offsets_are_posed_and_half_of_them_is_the_garment_s():
     torch.testing.assert_close(prediction.mesh[:, model.skin :], posed)
     still = model(BATCH, draw(model), wrinkles=False)
     torch.testing.assert_close(still.offsets, prediction.garment_offsets)
+
+
+def with_handles(frame: PoseFrame = PoseFrame.heading) -> tuple[LayeredAvatar, torch.Tensor]:
+    """A network whose handles lift the garment by 0, 0.1, ... m in its five training frames, and their transforms."""
+    transforms = torch.eye(4).repeat(5, 1, 1, 1)
+    angles = torch.linspace(-0.6, 0.6, 5)
+    transforms[:, 0, 1, 1], transforms[:, 0, 2, 2] = angles.cos(), angles.cos()
+    transforms[:, 0, 1, 2], transforms[:, 0, 2, 1] = -angles.sin(), angles.sin()
+    layout = HandleLayout.on_mesh(*map(torch.from_numpy, CLOTHED.garment), 20)
+    config = LayeredConfig(ENCODER, ENCODER, DECODER, DECODER, code_channels=6, pose_frame=frame)
+    handles = ClothHandles(layout, handle_poses(transforms, config))
+    with torch.no_grad():
+        handles.values[..., 1] = 0.1 * torch.arange(5)[:, None]
+    torch.manual_seed(0)
+    return LayeredAvatar(TEMPLATE, CLOTHED, config, handles), transforms
+
+
+def test_handles_give_training_frames_their_own_offsets_and_others_those_of_their_pose():
+    model, transforms = with_handles()
+    task = LayeredTask(model, TEMPLATE, TrainConfig(points=200), lambda step: BATCH, 5)
+    samples = draw(model)
+    batch = replace(BATCH, joint_transforms=transforms[[0, 3, 4]], frame_ids=torch.tensor([4, 0, 1]))
+    bare, lifted = (model.train()(batch, samples, wrinkles).offsets for wrinkles in (False, True))
+    wrinkles = model(batch, samples).wrinkle_offsets
+    given = torch.tensor([0, 0.1, 0]) * torch.tensor([[[4]], [[0]], [[1]]])
+    torch.testing.assert_close(lifted - bare - wrinkles, given.expand_as(lifted))
+    task.settle()
+    predicted = model.eval()(batch, samples)
+    parts = predicted.offsets - predicted.garment_offsets - predicted.wrinkle_offsets
+    expected = torch.tensor([0, 0.1, 0]) * torch.tensor([[[0]], [[3]], [[4]]])  # of the pose, not of the id
+    torch.testing.assert_close(parts, expected.expand_as(parts), atol=0.02, rtol=0)
+    still, _ = with_handles(PoseFrame.root)
+    LayeredTask(still, TEMPLATE, TrainConfig(points=200), lambda step: BATCH, 5).settle()
+    same = still.handles.predict(handle_poses(transforms, still.config))
+    torch.testing.assert_close(same[0], same[4])  # in the root frame all of these poses are one
+
+
+def test_handles_learn_from_the_frames_of_a_batch_alone():
+    model, transforms = with_handles()
+    task = LayeredTask(model.train(), TEMPLATE, TrainConfig(points=200), lambda step: BATCH, 5)
+    batch = replace(BATCH, joint_transforms=transforms[[0, 3, 3]], frame_ids=torch.tensor([0, 3, 3]))
+    task.loss((batch, draw(model)), Position(0, 1.0)).total.backward()
+    learned = model.handles.values.grad.abs().sum(dim=(1, 2)) > 0
+    assert learned.tolist() == [True, False, False, True, False]
 
 
 def objective(switches, loss):
@@ -206,9 +262,38 @@ def run(tiny_folder, tiny_outfit, tmp_path_factory) -> RunConfig:
     return config
 
 
+def test_a_mirror_image_is_a_training_frame_of_its_own(run, tiny_outfit):
+    method = find_method("layered")
+    mirrored = replace(run, train=replace(run.train, mirror=True))
+    settings = settings_from_dict(LayeredConfig, run.method.settings, "settings.")
+    task = method.prepare(mirrored, settings, tiny_outfit.template)
+    plain = method.prepare(run, settings, tiny_outfit.template)
+    frames = split_outfit(tiny_outfit, run.split).train
+    assert len(task.model.handles.values) == 2 * len(frames) == 2 * len(plain.model.handles.values)
+    seen = set()
+    for step in range(6):
+        batch = task.batch_at(step)
+        poses = handle_poses(batch.joint_transforms, settings)
+        torch.testing.assert_close(task.model.handles.poses[batch.frame_ids], poses, atol=1e-5, rtol=0)
+        assert tuple(frames[index % len(frames)] for index in batch.frame_ids.tolist()) == batch.names
+        seen |= set((batch.frame_ids >= len(frames)).tolist())
+    assert seen == {False, True}
+
+
+def test_handles_have_a_switch(run, tiny_outfit):
+    method, choice = find_method("layered"), replace(run.method, settings=run.method.settings | {"handles": 0})
+    settings = settings_from_dict(LayeredConfig, choice.settings, "settings.")
+    model = method.prepare(replace(run, method=choice), settings, tiny_outfit.template).model
+    assert model.handles is None and not any(name.startswith("handles") for name in model.state_dict())
+    assert method.static["handles"] == 0
+    with pytest.raises(AvatarError, match="handles"):
+        LayeredConfig(handles=3)
+
+
 def test_a_run_is_trained_and_comes_back_with_points_and_a_mesh_of_constant_topology(run, tiny_outfit, tmp_path):
     folder = train_run(run)
     avatar = load_avatar(folder)
+    assert float(avatar.model.handles.duals.abs().max()) > 0
     paths = predict_frames(avatar, tiny_outfit, "test", tmp_path / "points", tmp_path / "meshes", 1500)
     meshes = [read_mesh(tmp_path / "meshes" / f"{path.stem}.ply") for path in paths]
     assert len(meshes) == 3 and all(np.array_equal(mesh.faces, meshes[0].faces) for mesh in meshes)

@@ -1,0 +1,193 @@
+"""Cloth handles: places of a garment whose offsets a Gaussian process predicts from the pose.
+
+A few dozen scans cannot teach a network how a skirt follows the legs, but offsets that are smooth over the garment and
+in the pose can be interpolated between them: each training frame has the offset of every handle as parameters, and for
+other poses their posterior mean is taken, with a kernel that learns which joints move which part of the garment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.cluster.vq import kmeans2
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from torch import Tensor, nn
+
+from avatar.geometry.sparse import SparseRows, gather_sum, pick
+from avatar.geometry.surface import farthest_points
+from avatar.records import Tensors
+
+NEAREST = 4  # handles that move a vertex
+FAR = 1000.0  # metres, more than any way along a garment
+GROUPS = 12  # parts of a garment with a kernel each
+SCALE = 1.0  # metres one unit of a handle's parameters stands for: steps of Adam are millimetres
+FOLDS = 20  # runs of consecutive frames that are left out in turn, each with its mirror images
+FIT_STEPS, FIT_RATE = 120, 0.05  # of Adam, on the logarithms of a kernel's parameters
+FIT_FRAMES = 256  # at most, evenly spread, of those a kernel's parameters are fitted to
+PRICE = 0.01  # of relevance, against the logarithm of the error
+TOLERANCE = 1e-8  # square metres: an error that needs no explanation
+
+
+@dataclass(frozen=True)
+class HandleLayout(Tensors):
+    """Handles of a garment of V vertices: each vertex moves by ``shares (V, K)`` of the handles ``ids (V, K)``.
+
+    ``groups (H,)`` is the part of the garment that a handle belongs to.
+    """
+
+    ids: Tensor
+    shares: Tensor
+    groups: Tensor
+
+    @classmethod
+    def on_mesh(cls, vertices: Tensor, faces: Tensor, weights: Tensor, count: int) -> HandleLayout:
+        """Handles at ``count`` farthest points of a mesh ``(V, 3)``, or at all where it has fewer; at least five.
+
+        A vertex follows its nearest handles along edges, with shares that fall to zero at the next one (Sumner et al.
+        2007, embedded deformation); parts are clusters of the skinning weights ``(V, J)`` at the handles.
+        """
+        places = farthest_points(vertices, min(count, len(vertices))).numpy()
+        positions, corners = vertices.double().numpy(), faces.numpy()
+        ends = np.unique(np.sort(np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])), axis=0)
+        lengths = np.linalg.norm(positions[ends[:, 0]] - positions[ends[:, 1]], axis=1)
+        graph = coo_matrix((lengths, ends.T), shape=(len(positions),) * 2)
+        distances = dijkstra(graph, directed=False, indices=places).T
+        apart = np.linalg.norm(positions[:, None] - positions[places], axis=-1) + FAR
+        distances = np.where(np.isinf(distances), apart, distances)  # handles of other parts come last
+        ids = np.argsort(distances, axis=1, kind="stable")[:, : NEAREST + 1]
+        near = np.take_along_axis(distances, ids, axis=1)
+        shares = (1 - near[:, :-1] / near[:, -1:]) ** 2 + 1e-12
+        ids = ids[:, :-1]
+        seen = weights.numpy()[places].astype(np.float64)
+        kinds = min(GROUPS, len(np.unique(seen.round(2), axis=0)))
+        found = kmeans2(seen, kinds, minit="++", seed=np.random.default_rng(0))[1] if kinds > 1 else np.zeros(len(seen))
+        groups = torch.from_numpy(np.unique(found, return_inverse=True)[1])
+        shares = torch.from_numpy(shares / shares.sum(axis=1, keepdims=True)).float()
+        return cls(torch.from_numpy(ids), shares, groups)
+
+
+class ClothHandles(nn.Module):
+    """Offsets of a garment's vertices at rest by handles: parameters of the training frames, and what they predict.
+
+    ``values (N, H, 3)`` are the parameters; `fit` makes the regression from them, which later calls take.
+    """
+
+    def __init__(self, layout: HandleLayout, poses: Tensor):
+        """Builds handles for training frames with pose features ``(N, J, 9)`` (`pose_features`)."""
+        super().__init__()
+        handles, groups = len(layout.groups), int(layout.groups.max()) + 1
+        self.values = nn.Parameter(torch.zeros(len(poses), handles, 3))
+        state = {**vars(layout), "poses": poses, "relevance": torch.zeros(groups, poses.shape[1])}
+        state |= {"duals": torch.zeros(len(poses), handles, 3), "mean": torch.zeros(handles, 3)}
+        for name, value in state.items():
+            self.register_buffer(name, value.clone(), persistent=True)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Offsets ``(B, V, 3)``, metres, of training frames ``(B,)``."""
+        return self.spread(pick(self.values, frames) * SCALE)
+
+    def spread(self, offsets: Tensor) -> Tensor:
+        """Offsets of handles ``(B, H, 3)`` as those of vertices ``(B, V, 3)``."""
+        return gather_sum(offsets, SparseRows.of_table(self.ids, len(self.groups), self.shares))
+
+    def predict(self, poses: Tensor) -> Tensor:
+        """Offsets ``(B, V, 3)``, metres, for pose features ``(B, J, 9)``: the posterior mean."""
+        likeness = matern(squared_distances(poses, self.poses), self.relevance)  # (C, B, N)
+        moved = torch.einsum("hbn,nhc->bhc", likeness[self.groups], self.duals)
+        return self.spread(self.mean + moved)
+
+    def fit(self, mirrored: bool) -> None:
+        """Fits the kernels to the parameters, and the posterior mean with them; in float64 on the CPU.
+
+        ``mirrored`` says that the second half of the frames are the mirror images of the first. Each group's
+        relevance of joints and its noise minimise the error of frames left out (Rasmussen & Williams 5.4.2).
+        """
+        values = self.values.detach().cpu().double() * SCALE
+        poses, groups = self.poses.cpu().double(), self.groups.cpu()
+        images = 2 if mirrored else 1
+        folds = fold_numbers(len(poses) // images).repeat(images)
+        stride = -(-len(poses) // images // FIT_FRAMES)
+        some = torch.arange(len(poses) // images)[::stride]
+        some = torch.cat([some + image * (len(poses) // images) for image in range(images)])
+        mean = values.mean(dim=0)
+        between = squared_distances(poses, poses)
+        relevance, duals = torch.zeros(int(groups.max()) + 1, poses.shape[1]), torch.zeros_like(values)
+        for group in range(len(relevance)):
+            here = groups == group
+            targets = (values - mean)[:, here].flatten(1)
+            found, noise = fit_kernel(between[some][:, some], targets[some], folds[some])
+            kernel = matern(between, found[None])[0] + noise * torch.eye(len(poses), dtype=torch.float64)
+            duals[:, here] = torch.linalg.solve(kernel, targets).unflatten(1, (-1, 3))
+            relevance[group] = found.float()
+        for name, value in (("relevance", relevance), ("duals", duals), ("mean", mean)):
+            getattr(self, name).copy_(value.float())
+
+
+def pose_features(joint_transforms: Tensor, gravity: bool) -> Tensor:
+    """What a garment's offsets follow, ``(B, J, 4, 4)`` to ``(B, J, 9)``: each joint's rotation in the root's axes.
+
+    In place of the root's own is the direction of gravity there, or nothing.
+    """
+    rotations = joint_transforms[..., :3, :3]
+    root = rotations[:, :1].transpose(-1, -2)
+    features = (root @ rotations).flatten(-2).clone()
+    features[:, 0] = 0
+    if gravity:
+        features[:, 0, :3] = root[:, 0, :, 1]
+    return features
+
+
+def squared_distances(one: Tensor, other: Tensor) -> Tensor:
+    """Of pose features ``(B, J, 9)`` and ``(N, J, 9)``, joint by joint: ``(B, N, J)``."""
+    products = torch.einsum("bjc,njc->bnj", one, other)
+    lengths = one.square().sum(dim=-1)[:, None] + other.square().sum(dim=-1)
+    return (lengths - 2 * products).clamp(min=0)
+
+
+def matern(distances: Tensor, relevance: Tensor) -> Tensor:
+    """Matérn kernels of order 3/2: ``(B, N, J)`` squared distances and relevance ``(C, J)`` to ``(C, B, N)``."""
+    scaled = torch.einsum("bnj,cj->cbn", distances, relevance.square())
+    root = (3 * scaled + 1e-12).sqrt()
+    return (1 + root) * torch.exp(-root)
+
+
+def fold_numbers(frames: int) -> Tensor:
+    """Which of at most `FOLDS` runs of consecutive frames each is in ``(N,)``; neighbours in time leave together."""
+    count = min(FOLDS, frames)
+    return torch.arange(frames) * count // frames
+
+
+@torch.enable_grad()
+def fit_kernel(distances: Tensor, targets: Tensor, folds: Tensor) -> tuple[Tensor, Tensor]:
+    """Relevance ``(J,)`` and noise of a kernel, by the error of the folds ``(N,)`` left out, for targets ``(N, D)``."""
+    joints, products = distances.shape[-1], targets @ targets.T
+    logs = torch.cat([torch.full((joints,), -2.0), torch.tensor([-4.0])]).double().requires_grad_()
+    parts = [(folds == fold).nonzero()[:, 0] for fold in folds.unique()]
+    identity = torch.eye(len(distances), dtype=torch.float64)
+    optimiser = torch.optim.Adam([logs], lr=FIT_RATE)
+    for _ in range(FIT_STEPS if len(parts) > 2 else 0):
+        relevance, noise = logs[:-1].exp(), logs[-1].exp()
+        inverse = torch.linalg.inv(matern(distances, relevance[None])[0] + (noise + 1e-6) * identity)
+        error = 3 * left_out_error(inverse, products, parts) / targets.numel()
+        loss = (error + TOLERANCE).log() + PRICE * relevance.sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return logs[:-1].exp().detach(), logs[-1].exp().detach() + 1e-6
+
+
+def left_out_error(inverse: Tensor, products: Tensor, parts: list[Tensor]) -> Tensor:
+    """Summed square of how regression without one part of the frames misses that part, for all parts in turn.
+
+    From the inverse A ``(N, N)`` of the kernel matrix with its noise, and the products y y^T ``(N, N)`` of the targets
+    alone: a part b is missed by (A_bb)^-1 (A y)_b (Rasmussen & Williams eq. 5.12).
+    """
+    spread = inverse @ products @ inverse
+    errors = []
+    for part in parts:
+        own = torch.linalg.inv(inverse[part][:, part])
+        errors.append((own * (own @ spread[part][:, part])).sum())
+    return torch.stack(errors).sum()
