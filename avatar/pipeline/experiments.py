@@ -21,6 +21,7 @@ from avatar.export.meshing import require_poisson
 from avatar.export.pictures import load_pyvista
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.invocation import CONF
+from avatar.io.documents import read_json
 from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole
 from avatar.methods.base import CANONICALIZER, CLOTHED_TEMPLATE
@@ -37,6 +38,7 @@ from avatar.runs.training import train
 from avatar.settings import settings_from_dict
 from avatar.world import current_world
 
+FRONT_END = "front_end.json"  # in a canonicalizer's folder: processor seconds that it and its template took
 log = logging.getLogger(__name__)
 
 
@@ -68,6 +70,7 @@ class ExperimentConfig(JobConfig):
 
     surface: ExtractionConfig = field(default_factory=ExtractionConfig)  # of an implicit avatar
     compare: CompareConfig = field(default_factory=CompareConfig)
+    front_end: bool = False  # train.minutes count what the method's canonicalizer and clothed template took
     one_seed: tuple[str, ...] = ()  # variants that are trained with seed 0 alone, where others have several
 
     def __post_init__(self):
@@ -188,17 +191,54 @@ def experiment(config: ExperimentConfig) -> Path | list[Path]:
     if config.compare.pictures:
         load_pyvista()
     for settings in makers:
-        with lock_folder(settings.folder, wait=True):  # another job may be making it
+        with lock_folder(settings.folder, wait=True), counted(settings.folder):  # another job may be making it
             make_canonical_scans(settings, settings.frames())
             if CLOTHED_TEMPLATE in needs_of(config):
                 make_template(template_of(config, settings.outfit))
-    run = train(config.run)
+    run = train(charged(config, makers))
     made = {"points": config.points, "surface": config.surface, "device": config.device}
     for split in config.compare.splits if is_main else ():  # what the folder's ledgers know is not done again
         where = {"split": split, "data_root": config.data_root}
         predict(PredictConfig(run=run, **made, **where))
         evaluate(EvaluateConfig(runs=(run,), score=config.score, floors=split != VALIDATION, **where))
     return run
+
+
+@contextmanager
+def counted(folder: Path) -> Iterator[None]:
+    """Adds a block's processor time to a canonicalizer's `FRONT_END`, where the block makes scans or a template."""
+    made, started = newest_file(folder), time.process_time()
+    yield
+    if newest_file(folder) > made:
+        seconds = front_end_seconds(folder) + time.process_time() - started
+        write_whole(folder / FRONT_END, json.dumps({"processor_seconds": round(seconds, 1)}).encode())
+
+
+def newest_file(folder: Path) -> float:
+    """When the newest of a canonicalizer's scans and template files was written; 0 where there is none."""
+    files = [*folder.glob("scans/*/*.npz"), *folder.glob("template/*.npz")]
+    return max((path.stat().st_mtime for path in files), default=0.0)
+
+
+def front_end_seconds(folder: Path) -> float:
+    """Processor seconds that a canonicalizer's folder has taken so far."""
+    path = folder / FRONT_END
+    return float(read_json(path)["processor_seconds"]) if path.is_file() else 0.0
+
+
+def charged(config: ExperimentConfig, makers: Sequence[CanonicalizeConfig]) -> RunConfig:
+    """The training run, with ``front_end`` on those minutes of its budget that its canonicalizers have left.
+
+    Raises `AvatarError` where they have left none.
+    """
+    run, minutes = config.run, config.train.minutes
+    if not (config.front_end and minutes):
+        return run
+    left = minutes - sum(front_end_seconds(settings.folder) for settings in makers) / 60
+    if left <= 0:
+        problem = f"expected more than the front end took, {minutes - left:.1f} minutes, got {minutes:g}."
+        raise AvatarError(f"train.minutes: {problem} Hint: fewer steps of the canonicalizer, or front_end=false.")
+    return replace(run, train=replace(run.train, minutes=left))
 
 
 def canonicalizer_of(config: JobConfig, outfit: str) -> CanonicalizeConfig:

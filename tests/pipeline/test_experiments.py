@@ -22,7 +22,14 @@ from avatar.evaluation.tables import Axis, FormConfig, ReportedTable
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.methods.canonicalizer import CanonicalizeConfig, WeightSource
 from avatar.methods.settings import MethodChoice
-from avatar.pipeline.experiments import ExperimentConfig, experiment, tabulate_experiment
+from avatar.pipeline.experiments import (
+    ExperimentConfig,
+    canonicalizers_of,
+    charged,
+    experiment,
+    front_end_seconds,
+    tabulate_experiment,
+)
 from avatar.pipeline.reporting import CompareConfig, compare
 
 ROOT = Path(__file__).parents[2]
@@ -187,6 +194,16 @@ def test_a_method_that_takes_a_canonicalizer_gets_it_made_and_scored(first, tiny
     text = tabulate_experiment([job]).read_text()
     assert "scanimate" in text and "All methods: knn." in text
     assert "**tiny: canonical scans of test frames**" in text and "| truth_cm (cm) |" in text
+    counted = front_end_seconds(scans.parent)
+    experiment(job)
+    assert 0 < counted == front_end_seconds(scans.parent)  # what is not made again is not counted again
+    timed, makers = replace(job, train=replace(job.train, minutes=15.0)), canonicalizers_of(job)
+    assert charged(timed, makers).train.minutes == 15
+    timed = replace(timed, front_end=True)
+    assert charged(timed, makers).train.minutes == pytest.approx(15 - counted / 60)
+    assert charged(timed, makers).folder == timed.run.folder and charged(timed, []).train.minutes == 15
+    with pytest.raises(AvatarError, match=r"train\.minutes: expected more than the front end took"):
+        charged(replace(timed, train=replace(timed.train, minutes=counted / 60)), makers)
 
 
 @pytest.mark.slow
