@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
@@ -17,7 +17,7 @@ from avatar.body.skinning import skin_transforms
 from avatar.checks import AvatarError, DataError, check_range
 from avatar.data.batches import ACROSS, mirror_map
 from avatar.data.outfits import Outfit
-from avatar.data.splits import split_outfit
+from avatar.data.splits import sequence_of, split_outfit
 from avatar.geometry.cloth import ClothMesh, bending, body_contact, edge_strain, self_contact
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
 from avatar.geometry.transforms import invert_rigid, transform_points
@@ -48,7 +48,8 @@ STATE = ("vertices", "faces", "weights", "body_vertex", "covered")  # of the clo
 SKIN_SPACING = 0.03  # metres between the skin vertices that are encoded
 REST_APART = 0.04  # metres at rest from which on two places of a garment may not touch
 MIN_HANDLES = 20  # fewer cannot follow a garment
-TERMS = ("laplacian", "strain", "bending", "body_contact", "self_contact")
+CLOSE = 0.3  # of rotation matrices' entries, root mean square: more between two frames is no motion
+TERMS = ("laplacian", "strain", "bending", "body_contact", "self_contact", "temporal")
 
 
 class Head(Enum):
@@ -68,6 +69,7 @@ class ClothConfig:
     bent_rest: bool = False  # bending counts from the garment template's angles instead
     body_contact: float = 1e4  # mean square of what vertices lack of the gap to the body
     self_contact: float = 0.0  # the same between parts of the garment that are apart at rest
+    temporal: float = 0.0  # mean squared second difference of the handles between frames that follow each other
     gap: float = 0.003  # metres, from body to garment and from garment to garment
 
     def __post_init__(self):
@@ -88,6 +90,8 @@ class LayeredConfig(ClosetConfig):
         super().__post_init__()
         if self.handles and self.handles < MIN_HANDLES:
             raise AvatarError(f"handles: expected 0 for none, or at least {MIN_HANDLES}, got {self.handles}.")
+        if self.cloth.temporal and not self.handles:
+            raise AvatarError("cloth.temporal: it is about the handles, got handles=0. Hint: set it to 0.")
 
 
 class LayeredAvatar(ClosetAvatar):
@@ -197,6 +201,30 @@ def handle_poses(joint_transforms: Tensor, config: LayeredConfig) -> Tensor:
     return pose_features(joint_transforms, gravity=config.pose_frame is PoseFrame.heading)
 
 
+def consecutive_frames(names: Sequence[str], poses: Tensor) -> Tensor:
+    """Triples ``(T, 3)`` of frames, by index, that follow each other in a motion.
+
+    They are of one sequence (``<sequence>.<number>``), as far apart as its nearest frames are, and no joint turns much
+    from one to the next (pose features ``(N, J, 9)``): numbers of random poses follow each other, too.
+    """
+    numbers: dict[str, dict[int, int]] = {}
+    for index, name in enumerate(names):
+        number = name.rpartition(".")[2]
+        if number.isdecimal():
+            numbers.setdefault(sequence_of(name), {})[int(number)] = index
+    triples = []
+    for frames in numbers.values():
+        step = int(np.diff(sorted(frames)).min(initial=1 << 30)) if len(frames) > 2 else 0
+        triples += [
+            [frames[number - step], index, frames[number + step]]
+            for number, index in sorted(frames.items())
+            if step and {number - step, number + step} <= frames.keys()
+        ]
+    found = torch.tensor(triples, dtype=torch.int64).reshape(-1, 3)
+    turns = [(poses[found[:, place]] - poses[found[:, place + 1]]).square().mean(dim=-1) for place in (0, 1)]
+    return found[(torch.stack(turns).sqrt() < CLOSE).all(dim=2).all(dim=0)]
+
+
 class LayeredTask(PointTask):
     """Training on points of the clothed template's visible surface, with the terms of its mesh."""
 
@@ -223,6 +251,7 @@ class LayeredTask(PointTask):
             "bending": lambda: bending(cloth.angles(garment), cloth.angles(rest) if config.bent_rest else None),
             "body_contact": lambda: body_contact(garment, batch.vertices, model.body_faces, config.gap),
             "self_contact": lambda: self_contact(garment, flat, config.gap, REST_APART),
+            "temporal": lambda: model.handles.unsteadiness(),
         }
         weights = {name: getattr(config, name) for name in TERMS if getattr(config, name)}
         raw = {name: measures[name]() for name in weights}
@@ -267,12 +296,14 @@ class Layered(PointMethod):
             frames = split_outfit(outfits[0], run.split).train
             bodies = [outfits[0].load_body("train", name).joint_transforms for name in frames]
             transforms = torch.as_tensor(np.stack(bodies), dtype=torch.float32)
+            triples = consecutive_frames(frames, handle_poses(transforms, settings))
             if run.train.mirror:
                 joints = mirror_map(template).joints
                 transforms = torch.cat([transforms, ACROSS @ transforms[:, joints] @ ACROSS])
+                triples = torch.cat([triples, triples + len(frames)])
             garment = clothed.garment
             layout = HandleLayout.on_mesh(*map(torch.from_numpy, garment), settings.handles)
-            handles = ClothHandles(layout, handle_poses(transforms, settings))
+            handles = ClothHandles(layout, handle_poses(transforms, settings), triples)
         return LayeredAvatar(template, clothed, settings, handles)
 
     def untrained(self, settings: LayeredConfig, template: Template) -> nn.Module:

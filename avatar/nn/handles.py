@@ -75,8 +75,9 @@ class ClothHandles(nn.Module):
     ``values (N, H, 3)`` are the parameters; `fit` makes the regression from them, which later calls take.
     """
 
-    def __init__(self, layout: HandleLayout, poses: Tensor):
-        """Builds handles for training frames with pose features ``(N, J, 9)`` (`pose_features`)."""
+    def __init__(self, layout: HandleLayout, poses: Tensor, triples: Tensor | None = None):
+        """Builds handles for training frames with pose features ``(N, J, 9)`` (`pose_features`), of which ``triples
+        (T, 3)`` follow each other in time."""
         super().__init__()
         handles, groups = len(layout.groups), int(layout.groups.max()) + 1
         self.values = nn.Parameter(torch.zeros(len(poses), handles, 3))
@@ -84,10 +85,19 @@ class ClothHandles(nn.Module):
         state |= {"duals": torch.zeros(len(poses), handles, 3), "mean": torch.zeros(handles, 3)}
         for name, value in state.items():
             self.register_buffer(name, value.clone(), persistent=True)
+        nothing = torch.empty(0, 3, dtype=torch.int64)
+        self.register_buffer("triples", nothing if triples is None else triples, persistent=False)
 
     def forward(self, frames: Tensor) -> Tensor:
         """Offsets ``(B, V, 3)``, metres, of training frames ``(B,)``."""
         return self.spread(pick(self.values, frames) * SCALE)
+
+    def unsteadiness(self) -> Tensor:
+        """Mean squared second difference in time of the training frames' offsets, square metres; 0 without triples."""
+        if not len(self.triples):
+            return self.values.sum() * 0
+        before, now, after = (pick(self.values, self.triples[:, place]) * SCALE for place in range(3))
+        return (before - 2 * now + after).square().sum(dim=-1).mean()
 
     def spread(self, offsets: Tensor) -> Tensor:
         """Offsets of handles ``(B, H, 3)`` as those of vertices ``(B, V, 3)``."""
