@@ -82,6 +82,7 @@ class LayeredConfig(ClosetConfig):
 
     code_skip: bool = True  # the decoders see the garment code itself beside its features
     free_offsets: bool = True  # an offset of each vertex, learned beside the code, is added to the template's
+    pose_frame: PoseFrame = PoseFrame.heading  # the skirt of a bending person hangs down
     handles: int = 600  # places of the garment that a Gaussian process moves with the pose; 0 for none
     head: Head = Head.mesh
     cloth: ClothConfig = field(default_factory=ClothConfig)
