@@ -28,6 +28,7 @@ FOLDS = 20  # runs of consecutive frames that are left out in turn, each with it
 FIT_STEPS, FIT_RATE = 120, 0.05  # of Adam, on the logarithms of a kernel's parameters
 FIT_FRAMES = 256  # at most, evenly spread, of those a kernel's parameters are fitted to
 PRICE = 0.01  # of relevance, against the logarithm of the error
+JITTER = 1e-6  # of a kernel's noise, at least
 TOLERANCE = 1e-8  # square metres: an error that needs no explanation
 
 
@@ -123,15 +124,14 @@ class ClothHandles(nn.Module):
         some = torch.arange(len(poses) // images)[::stride]
         some = torch.cat([some + image * (len(poses) // images) for image in range(images)])
         mean = values.mean(dim=0)
-        between = squared_distances(poses, poses)
-        relevance, duals = torch.zeros(int(groups.max()) + 1, poses.shape[1]), torch.zeros_like(values)
-        for group in range(len(relevance)):
-            here = groups == group
-            targets = (values - mean)[:, here].flatten(1)
-            found, noise = fit_kernel(between[some][:, some], targets[some], folds[some])
-            kernel = matern(between, found[None])[0] + noise * torch.eye(len(poses), dtype=torch.float64)
-            duals[:, here] = torch.linalg.solve(kernel, targets).unflatten(1, (-1, 3))
-            relevance[group] = found.float()
+        between, parts = squared_distances(poses, poses), [groups == group for group in range(int(groups.max()) + 1)]
+        targets = [(values - mean)[:, part].flatten(1) for part in parts]
+        products = torch.stack([each[some] @ each[some].T / each.shape[1] for each in targets])
+        relevance, noise = fit_kernels(between[some][:, some], products, folds[some])
+        duals = torch.zeros_like(values)
+        for group, part in enumerate(parts):
+            kernel = matern(between, relevance[group : group + 1])[0] + noise[group] * torch.eye(len(poses)).double()
+            duals[:, part] = torch.linalg.solve(kernel, targets[group]).unflatten(1, (-1, 3))
         for name, value in (("relevance", relevance), ("duals", duals), ("mean", mean)):
             getattr(self, name).copy_(value.float())
 
@@ -171,33 +171,49 @@ def fold_numbers(frames: int) -> Tensor:
 
 
 @torch.enable_grad()
-def fit_kernel(distances: Tensor, targets: Tensor, folds: Tensor) -> tuple[Tensor, Tensor]:
-    """Relevance ``(J,)`` and noise of a kernel, by the error of the folds ``(N,)`` left out, for targets ``(N, D)``."""
-    joints, products = distances.shape[-1], targets @ targets.T
-    logs = torch.cat([torch.full((joints,), -2.0), torch.tensor([-4.0])]).double().requires_grad_()
-    parts = [(folds == fold).nonzero()[:, 0] for fold in folds.unique()]
+def fit_kernels(distances: Tensor, products: Tensor, folds: Tensor) -> tuple[Tensor, Tensor]:
+    """Relevance ``(C, J)`` and noise ``(C,)`` of each group's kernel, by the error of the folds ``(N,)`` left out.
+
+    ``distances (N, N, J)`` are squared and joint by joint; ``products (C, N, N)`` are y y^T of the groups' targets,
+    means over their columns, square metres.
+    """
+    groups, parts = len(products), fold_members(folds)
+    logs = torch.cat([torch.full((groups, distances.shape[-1]), -2.0), torch.full((groups, 1), -4.0)], dim=1)
+    logs = logs.double().requires_grad_()
     identity = torch.eye(len(distances), dtype=torch.float64)
     optimiser = torch.optim.Adam([logs], lr=FIT_RATE)
-    for _ in range(FIT_STEPS if len(parts) > 2 else 0):
-        relevance, noise = logs[:-1].exp(), logs[-1].exp()
-        inverse = torch.linalg.inv(matern(distances, relevance[None])[0] + (noise + 1e-6) * identity)
-        error = 3 * left_out_error(inverse, products, parts) / targets.numel()
-        loss = (error + TOLERANCE).log() + PRICE * relevance.sum()
+    for _ in range(FIT_STEPS if len(folds.unique()) > 2 else 0):
+        relevance, noise = logs[:, :-1].exp(), logs[:, -1].exp() + JITTER
+        inverse = torch.linalg.inv(matern(distances, relevance) + noise[:, None, None] * identity)
+        error = 3 * left_out_error(inverse, products, parts) / len(folds)
+        loss = ((error + TOLERANCE).log() + PRICE * relevance.sum(dim=1)).sum()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    return logs[:-1].exp().detach(), logs[-1].exp().detach() + 1e-6
+    found = logs.detach().exp()
+    return found[:, :-1], found[:, -1] + JITTER
+
+
+def fold_members(folds: Tensor) -> list[Tensor]:
+    """The frames of each fold of ``(N,)``, as tables ``(P, M)`` of folds of one size."""
+    tables: dict[int, list[Tensor]] = {}
+    for fold in folds.unique():
+        members = (folds == fold).nonzero()[:, 0]
+        tables.setdefault(len(members), []).append(members)
+    return [torch.stack(rows) for rows in tables.values()]
 
 
 def left_out_error(inverse: Tensor, products: Tensor, parts: list[Tensor]) -> Tensor:
-    """Summed square of how regression without one part of the frames misses that part, for all parts in turn.
+    """Summed square of how regression without a fold of the frames misses that fold, for all folds in turn: ``(C,)``.
 
-    From the inverse A ``(N, N)`` of the kernel matrix with its noise, and the products y y^T ``(N, N)`` of the targets
-    alone: a part b is missed by (A_bb)^-1 (A y)_b (Rasmussen & Williams eq. 5.12).
+    From the inverses A ``(C, N, N)`` of kernel matrices with their noise, and the products y y^T ``(C, N, N)`` of
+    targets alone: a fold b is missed by (A_bb)^-1 (A y)_b (Rasmussen & Williams eq. 5.12). ``parts`` as `fold_members`
+    has them.
     """
     spread = inverse @ products @ inverse
     errors = []
     for part in parts:
-        own = torch.linalg.inv(inverse[part][:, part])
-        errors.append((own * (own @ spread[part][:, part])).sum())
-    return torch.stack(errors).sum()
+        rows, columns = part[:, :, None], part[:, None, :]
+        own = torch.linalg.inv(inverse[:, rows, columns])
+        errors.append((own * (own @ spread[:, rows, columns])).sum(dim=(1, 2, 3)))
+    return torch.stack(errors).sum(dim=0)

@@ -10,6 +10,7 @@ from avatar.geometry.surface import farthest_points
 from avatar.nn.handles import (
     ClothHandles,
     HandleLayout,
+    fold_members,
     fold_numbers,
     left_out_error,
     matern,
@@ -86,14 +87,16 @@ def test_frames_left_out_are_missed_as_by_a_regression_without_them():
     targets = torch.randn(9, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     kernel = matern(squared_distances(poses, poses), torch.full((1, 3), 0.4, dtype=torch.float64))[0]
     kernel = kernel + 0.05 * torch.eye(9)
-    parts = [torch.tensor([0, 5]), torch.tensor([1, 2, 8]), torch.tensor([3, 4, 6, 7])]
+    parts = [torch.tensor([0, 5]), torch.tensor([1, 2, 8]), torch.tensor([3, 4]), torch.tensor([6, 7])]
+    folds = torch.tensor([0, 1, 1, 2, 2, 0, 3, 3, 1])
     expected = 0.0
     for part in parts:
         rest = torch.tensor([row for row in range(9) if row not in part.tolist()])
         found = kernel[part][:, rest] @ torch.linalg.solve(kernel[rest][:, rest], targets[rest])
         expected += float((targets[part] - found).square().sum())
-    found = left_out_error(torch.linalg.inv(kernel), targets @ targets.T, parts)
-    assert float(found) == pytest.approx(expected, rel=1e-9)
+    inverse, products = torch.linalg.inv(kernel), targets @ targets.T
+    found = left_out_error(torch.stack([inverse, inverse]), torch.stack([products, 4 * products]), fold_members(folds))
+    assert found.tolist() == pytest.approx([expected, 4 * expected], rel=1e-9)
 
 
 def test_neighbours_in_time_are_left_out_together():
