@@ -119,7 +119,7 @@ def test_a_loss_weight_that_a_paper_fixes_is_set_in_one_place():
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes_and_says_how_to_run_it(experiment):
     config = load("experiment", f"experiment={experiment}")
-    assert config.compare.table == experiment and config.run.name.startswith((experiment, "paper"))
+    assert config.compare.table == experiment and config.run.name.startswith((experiment, "paper", "closet_pop"))
     assert set(config.score.metrics) == set(config.compare.metrics)
     lines = (CONF / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[:2] == ["# @package _global_", f"# python tools/experiment.py experiment={experiment}"]
