@@ -9,7 +9,7 @@ import pretended
 import pytest
 import torch
 from safetensors.torch import load_file
-from tiny import DECODER, SETTINGS, canonical_truth, quick_training
+from tiny import DECODER, SETTINGS, canonical_truth, dressed_trunk, quick_training
 
 from avatar.canonical.canonicalizer import CanonicalizerConfig
 from avatar.canonical.fields import SkinningFieldConfig
@@ -21,6 +21,7 @@ from avatar.environment import choose_device
 from avatar.evaluation.scores import read_scores
 from avatar.evaluation.scoring import ScoreConfig
 from avatar.implicit.extraction import ExtractionConfig
+from avatar.io.clothed_templates import write_clothed_template
 from avatar.io.frames import write_canonical_scan
 from avatar.io.motions import write_motion
 from avatar.io.points import read_points
@@ -67,6 +68,8 @@ METHODS = {
     "closet_pointnext": ("closet", SETTINGS | {"encoder": "pointnext"}),
     "pop": ("pop", POP),
     "pop_etd": ("pop", POP | {"template": True}),
+    "layered": ("layered", SETTINGS | {"handles": 40, "cloth": {"self_contact": 1.0, "temporal": 1.0}}),
+    "layered_points": ("layered", SETTINGS | {"handles": 40, "head": "points"}),
     "scale": ("scale", SCALE),
     "scale_global": ("scale", SCALE | {"pose_feature": "global"}),
     "scanimate": ("scanimate", implicit()),
@@ -74,7 +77,13 @@ METHODS = {
     "scanimate_global": ("scanimate", implicit(pose="global")),
     "colored": ("scanimate", implicit(colored=True)),
 }
-RESUMED = ("closet", "closet_learned", "pop", "scanimate")  # stopped after a step: one for each kind of state
+RESUMED = (
+    "closet",
+    "closet_learned",
+    "layered",
+    "pop",
+    "scanimate",
+)  # stopped after a step: one for each kind of state
 FIELD = SkinningFieldConfig(width=16, layers=2, skip=1, orders=2)
 CYCLES = CycleConfig(
     first_steps=2,
@@ -124,6 +133,7 @@ def runs(tiny_folder, tiny_outfit, tmp_path_factory, device) -> dict[str, RunCon
             upper = (scan.points[:, 1:2] > 0.3).astype(np.float32)
             colors = np.concatenate([upper, 1 - upper, 0 * upper], axis=1)
             write_canonical_scan(path, replace(scan, colors=colors))
+        write_clothed_template(folder / "template" / "template.npz", dressed_trunk(tiny_outfit.template))
         found[kind] = RunConfig(
             outfit=(tiny_folder.name,),
             scan=ScanConfig(points=1500),

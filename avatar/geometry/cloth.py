@@ -6,6 +6,7 @@ Every measure is a mean, so that its weight does not depend on the resolution, a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -59,13 +60,18 @@ class ClothMesh(Tensors):
 
     def differences(self, values: Tensor) -> Tensor:
         """Values ``(B, V, C)`` less the mean of their neighbours' along edges (the uniform Laplacian), alike."""
-        count = values.shape[-2]
-        both = torch.cat([self.edges, self.edges.flip(1)])
+        return values - gather_sum(values, *self.neighbours)
+
+    @cached_property
+    def neighbours(self) -> tuple[SparseRows, SparseRows]:
+        """The mean over a vertex's neighbours along edges, and its transpose."""
+        edges = self.edges.cpu()
+        both = torch.cat([edges, edges.flip(1)])
         both = both[both[:, 0].argsort(stable=True)]
-        number = torch.bincount(both[:, 0], minlength=count)
-        starts = number.cumsum(0) - number
-        shares = (1 / number.clamp(min=1).to(values.dtype))[both[:, 0]]
-        return values - gather_sum(values, SparseRows(both[:, 1], starts, shares, count))
+        number = torch.bincount(both[:, 0])
+        parts = both[:, 1], number.cumsum(0) - number, (1 / number.float())[both[:, 0]]
+        mean = SparseRows(*(part.to(self.edges.device) for part in parts), len(number))
+        return mean, mean.transpose()
 
 
 def edge_strain(lengths: Tensor, rest: Tensor) -> Tensor:

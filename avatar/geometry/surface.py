@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from avatar.checks import AvatarError, check_finite, check_shape
 from avatar.geometry.sparse import SparseRows, gather_sum
 from avatar.records import SurfaceSamples
+
+RINGS = WeakTensorKeyDictionary()  # faces to the sparse tables of `vertex_normals`
 
 
 def face_cross_products(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -24,11 +27,21 @@ def face_areas(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Area-weighted unit normals of the vertices. ``(..., V, 3)`` to ``(..., V, 3)``; zero where undefined."""
-    crosses = face_cross_products(vertices, faces)
-    normals = torch.zeros_like(vertices)
-    for corner in range(3):
-        normals = normals.index_add(-2, faces[:, corner], crosses)
+    """Area-weighted unit normals of the vertices. ``(..., V, 3)`` to ``(..., V, 3)``; zero where undefined.
+
+    Repeatable on every device, backward pass included. The tables of a faces tensor are kept as long as it lives, so it
+    must not change in place.
+    """
+    check_shape("vertices", vertices, "... V 3")
+    check_shape("faces", faces, "F 3")
+    count, kept = vertices.shape[-2], RINGS.get(faces)
+    if kept is None or kept[0].rows != count:
+        corners = [SparseRows.of_table(faces[:, corner, None], count) for corner in range(3)]
+        around = SparseRows.of_table(faces, count).transpose()
+        kept = (*corners, *(corner.transpose() for corner in corners), around, around.transpose())
+        RINGS[faces] = kept
+    a, b, c = (gather_sum(vertices, kept[corner], kept[3 + corner]) for corner in range(3))
+    normals = gather_sum(torch.linalg.cross(b - a, c - a, dim=-1), *kept[6:])
     return torch.nn.functional.normalize(normals, dim=-1, eps=1e-20)
 
 

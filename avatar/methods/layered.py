@@ -133,8 +133,9 @@ class LayeredAvatar(ClosetAvatar):
     @property
     def garment_vertices(self) -> SurfaceSamples:
         """The garment's vertices as points of what is encoded."""
-        ids = torch.arange(self.garment_count, device=self.vertices.device)
-        corners = torch.eye(3, device=ids.device)[:1].expand(len(ids), 3)
+        ids = torch.arange(self.garment_count).to(self.vertices.device)
+        corners = self.vertices.new_zeros(len(ids), 3)
+        corners[:, 0] = 1
         return SurfaceSamples(ids[:, None].expand(-1, 3), corners, torch.full_like(ids, -1))
 
     def draw_samples(self, points: int, generator: torch.Generator) -> SurfaceSamples:
