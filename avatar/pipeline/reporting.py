@@ -183,7 +183,7 @@ def pose_pictures(config: ReportConfig, avatar: TrainedAvatar, outfit: Outfit, n
         shown["template"] = Picture(pictures.render_points(garment, camera), f"garment template posed as {name}")
     mesh = scored.meshes_folder(config.run, config.split, outfit.name) / f"{name}.ply"
     if mesh.is_file():
-        shown["mesh"] = Picture(pictures.render_mesh(read_mesh(mesh), camera), f"Poisson mesh of {name}")
+        shown["mesh"] = Picture(pictures.render_mesh(read_mesh(mesh), camera), f"mesh of {name}")
     return PictureRow(f"{outfit.name}: {name}", tuple(map(shown.get, COLUMNS)))
 
 
