@@ -59,13 +59,14 @@ def test_peak_memory_is_that_of_one_candidate_in_its_own_process():
 
 
 def test_references_agree_and_every_topic_has_its_rows(tmp_path):
-    topics = ("nearest", "chamfer", "pointnet2", "step", "predict", "canonicalizer", "extraction")
+    topics = ("nearest", "chamfer", "pointnet2", "step", "predict", "canonicalizer", "extraction", "mesh")
     rows = run_quick(tmp_path, *topics)
     assert {row.outfit for row in rows} == {"machine", *topics}
     ratios = [row for row in rows if row.metric in ("ratio", "processor_ratio")]
     assert all(0 < row.value < math.inf for row in ratios)
     assert {row.method for row in ratios if row.outfit == "nearest"} == {"ours", "brute force", "scipy", "open3d"}
     assert {row.method for row in ratios if row.outfit == "step"} == {"closet_small", "pop_small"}
+    assert "layered_small" in {row.method for row in ratios if row.outfit == "mesh"}
     gaps = {(row.outfit, row.method): row.value for row in rows if row.metric == "gap"}
     assert len(gaps) == 4 + 3 + 4 + 2 and max(gaps.values()) < 1e-3
     assert all(row.unit and math.isnan(row.value) for row in rows if row.metric == "absent")

@@ -29,6 +29,7 @@ from benchmarks.search import chamfer_comparisons, nearest_comparisons
 from benchmarks.surfaces import (
     canonicalizer_comparisons,
     extraction_comparisons,
+    mesh_comparisons,
     poisson_comparisons,
     simulation_comparisons,
 )
@@ -43,6 +44,7 @@ COMPARISONS: dict[str, Callable[[Job], list[Comparison]]] = {
     "canonicalizer": canonicalizer_comparisons,
     "extraction": extraction_comparisons,
     "poisson": poisson_comparisons,
+    "mesh": mesh_comparisons,
     "simulation": simulation_comparisons,
 }
 OTHERS: dict[str, Callable[[Job, int], list[Figure]]] = {"growth": growth_figures, "ceilings": ceiling_figures}

@@ -15,7 +15,12 @@ from avatar.canonical.scans import prepare_scan
 from avatar.export.meshing import PoissonConfig, PoissonMesher
 from avatar.implicit.extraction import ExtractionConfig, extract_surface
 from avatar.implicit.networks import PosedSdf, SdfConfig
+from avatar.methods.base import TrainedAvatar
 from avatar.methods.canonicalizer import CanonicalizerTask, CycleConfig
+from avatar.methods.layered import LayeredConfig, handle_poses
+from avatar.methods.registry import find_method
+from avatar.methods.settings import MethodChoice, RunConfig
+from avatar.nn.handles import ClothHandles, HandleLayout
 from avatar.records import Mesh, PointCloud
 from avatar.settings import settings_from_dict
 from avatar.simulate.dressing import DressedBody, TravelConfig
@@ -83,16 +88,44 @@ def poisson_comparisons(job: Job) -> list[Comparison]:
     if find_spec("open3d") is None:
         return [Comparison("poisson", f"{points:,} points", {}, "", absent={"depth 8": absence("open3d")})]
 
-    def prepare(depth: int) -> Run:
-        garment = sample_outfit()
-        scan = garment.load("train", garment.frames("train")[0]).scan
-        chosen = np.random.default_rng(0).permutation(len(scan.points))[:points]
-        cloud = PointCloud(scan.points[chosen], scan.normals[chosen])
-        mesher = PoissonMesher(PoissonConfig(depth=depth, max_hole=0.1))
-        return lambda: mesher.mesh(cloud)
-
-    candidates = {f"depth {depth}": partial(prepare, depth) for depth in (depths - 1, depths)}
+    candidates = {f"depth {depth}": partial(prepare_poisson, depth, points) for depth in (depths - 1, depths)}
     return [Comparison("poisson", f"{points:,} points", candidates, f"depth {depths}", points=points)]
+
+
+def prepare_poisson(depth: int, points: int) -> Run:
+    """Poisson meshing of a scan's points, of at most as many as it has."""
+    garment = sample_outfit()
+    scan = garment.load("train", garment.frames("train")[0]).scan
+    chosen = np.random.default_rng(0).permutation(len(scan.points))[:points]
+    cloud = PointCloud(scan.points[chosen], scan.normals[chosen])
+    mesher = PoissonMesher(PoissonConfig(depth=depth, max_hole=0.1))
+    return lambda: mesher.mesh(cloud)
+
+
+def mesh_comparisons(job: Job) -> list[Comparison]:
+    """A frame's mesh: the layered avatar's own from a posed body, all of it garment, and Poisson from points."""
+    points, depth, frames = job.size(50_000, 3000), job.size(8, 6), job.size(120, 6)
+    outfit = sample_outfit()
+    method, body = find_method("layered"), outfit.load_body("train", outfit.frames("train")[0])
+
+    def prepare(label: str) -> Run:
+        settings = settings_from_dict(LayeredConfig, job.avatars[label], f"avatars.{label}.")
+        model = method.untrained(settings, outfit.template)
+        parts = model.vertices[: model.garment_count], model.garment_faces, model.clothed_weights
+        poses = handle_poses(torch.as_tensor(body.joint_transforms).float().expand(frames, -1, 4, 4), settings)
+        model.handles = ClothHandles(HandleLayout.on_mesh(*parts, settings.handles), poses)
+        run = RunConfig(method=MethodChoice("layered", "layered"))
+        avatar = TrainedAvatar(method, settings, model.to(job.device).eval(), outfit.template, run, 0, 0.0)
+        predict = method.predictor(avatar, outfit.name, points, ExtractionConfig())
+        return lambda: predict(body).mesh.vertices
+
+    sizes = [label for label in job.avatars if label.startswith("closet_")]  # the layered avatar's sizes are CloSET's
+    candidates, absent = {label.replace("closet", "layered"): partial(prepare, label) for label in sizes}, {}
+    if find_spec("open3d") is None:
+        absent["Poisson"] = absence("open3d")
+    else:
+        candidates["Poisson"] = partial(prepare_poisson, depth, points)
+    return [Comparison("mesh", f"{points:,} points", candidates, "layered_small", absent=absent, points=points)]
 
 
 def simulation_comparisons(job: Job) -> list[Comparison]:

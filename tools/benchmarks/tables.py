@@ -31,6 +31,7 @@ TITLES = {
     "canonicalizer": "A step of the canonicalizer (its first stage is the baseline)",
     "extraction": "Surface of a signed distance (ours is the baseline; differences of vertices, metres)",
     "poisson": "Poisson meshing (the deepest is the baseline; its worker's processor time and memory are not counted)",
+    "mesh": "Mesh of a frame: the layered avatar's own, 12,272 garment vertices, and Poisson meshing of points",
     "simulation": "Simulated frame (the tee is the baseline)",
     "growth": "Growth of the small CloSET's training step (in processor seconds, those of the largest size shown)",
     "ceilings": "Share of the machine's ceilings (rates a processor second, of one core; a step is timed once)",
