@@ -14,6 +14,7 @@ import torch
 from scipy.cluster.vq import kmeans2
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial.distance import cdist
 from torch import Tensor, nn
 
 from avatar.geometry.sparse import SparseRows, gather_sum, pick
@@ -26,7 +27,7 @@ GROUPS = 12  # parts of a garment with a kernel each
 SCALE = 1.0  # metres one unit of a handle's parameters stands for: steps of Adam are millimetres
 FOLDS = 20  # runs of consecutive frames that are left out in turn, each with its mirror images
 FIT_STEPS, FIT_RATE = 120, 0.05  # of Adam, on the logarithms of a kernel's parameters
-FIT_FRAMES = 256  # at most, evenly spread, of those a kernel's parameters are fitted to
+FIT_FRAMES = 256  # about as many at most, evenly spread, a kernel's parameters are fitted to
 PRICE = 0.01  # of relevance, against the logarithm of the error
 JITTER = 1e-6  # of a kernel's noise, at least
 TOLERANCE = 1e-8  # square metres: an error that needs no explanation
@@ -56,8 +57,8 @@ class HandleLayout(Tensors):
         lengths = np.linalg.norm(positions[ends[:, 0]] - positions[ends[:, 1]], axis=1)
         graph = coo_matrix((lengths, ends.T), shape=(len(positions),) * 2)
         distances = dijkstra(graph, directed=False, indices=places).T
-        apart = np.linalg.norm(positions[:, None] - positions[places], axis=-1) + FAR
-        distances = np.where(np.isinf(distances), apart, distances)  # handles of other parts come last
+        if np.isinf(distances).any():  # handles of other parts come last
+            distances = np.where(np.isinf(distances), cdist(positions, positions[places]) + FAR, distances)
         ids = np.argsort(distances, axis=1, kind="stable")[:, : NEAREST + 1]
         near = np.take_along_axis(distances, ids, axis=1)
         shares = (1 - near[:, :-1] / near[:, -1:]) ** 2 + 1e-12
@@ -106,7 +107,7 @@ class ClothHandles(nn.Module):
 
     def predict(self, poses: Tensor) -> Tensor:
         """Offsets ``(B, V, 3)``, metres, for pose features ``(B, J, 9)``: the posterior mean."""
-        likeness = matern(squared_distances(poses, self.poses), self.relevance)  # (C, B, N)
+        likeness = matern(pose_distances(poses, self.poses, self.relevance))  # (C, B, N)
         moved = torch.einsum("hbn,nhc->bhc", likeness[self.groups], self.duals)
         return self.spread(self.mean + moved)
 
@@ -119,18 +120,17 @@ class ClothHandles(nn.Module):
         values = self.values.detach().cpu().double() * SCALE
         poses, groups = self.poses.cpu().double(), self.groups.cpu()
         images = 2 if mirrored else 1
-        folds = fold_numbers(len(poses) // images).repeat(images)
-        stride = -(-len(poses) // images // FIT_FRAMES)
-        some = torch.arange(len(poses) // images)[::stride]
-        some = torch.cat([some + image * (len(poses) // images) for image in range(images)])
-        mean = values.mean(dim=0)
-        between, parts = squared_distances(poses, poses), [groups == group for group in range(int(groups.max()) + 1)]
+        frames, mean = len(poses) // images, values.mean(dim=0)
+        some = torch.arange(frames)[:: -(-len(poses) // FIT_FRAMES)]
+        some = torch.cat([some + image * frames for image in range(images)])
+        parts = [groups == group for group in range(int(groups.max()) + 1)]
         targets = [(values - mean)[:, part].flatten(1) for part in parts]
         products = torch.stack([each[some] @ each[some].T / each.shape[1] for each in targets])
-        relevance, noise = fit_kernels(between[some][:, some], products, folds[some])
+        relevance, noise = fit_kernels(poses[some], products, fold_numbers(frames).repeat(images)[some])
         duals = torch.zeros_like(values)
         for group, part in enumerate(parts):
-            kernel = matern(between, relevance[group : group + 1])[0] + noise[group] * torch.eye(len(poses)).double()
+            kernel = matern(pose_distances(poses, poses, relevance[group : group + 1]))[0]
+            kernel.diagonal().add_(noise[group])
             duals[:, part] = torch.linalg.solve(kernel, targets[group]).unflatten(1, (-1, 3))
         for name, value in (("relevance", relevance), ("duals", duals), ("mean", mean)):
             getattr(self, name).copy_(value.float())
@@ -150,17 +150,16 @@ def pose_features(joint_transforms: Tensor, gravity: bool) -> Tensor:
     return features
 
 
-def squared_distances(one: Tensor, other: Tensor) -> Tensor:
-    """Of pose features ``(B, J, 9)`` and ``(N, J, 9)``, joint by joint: ``(B, N, J)``."""
-    products = torch.einsum("bjc,njc->bnj", one, other)
-    lengths = one.square().sum(dim=-1)[:, None] + other.square().sum(dim=-1)
-    return (lengths - 2 * products).clamp(min=0)
+def pose_distances(one: Tensor, other: Tensor, relevance: Tensor) -> Tensor:
+    """Squared distances ``(C, B, N)`` of pose features ``(B, J, 9)`` and ``(N, J, 9)`` by each relevance ``(C, J)``."""
+    first, second = ((part * relevance[:, None, :, None]).flatten(2) for part in (one, other))
+    lengths = first.square().sum(dim=-1)[:, :, None] + second.square().sum(dim=-1)[:, None]
+    return (lengths - 2 * first @ second.transpose(-1, -2)).clamp(min=0)
 
 
-def matern(distances: Tensor, relevance: Tensor) -> Tensor:
-    """Matérn kernels of order 3/2: ``(B, N, J)`` squared distances and relevance ``(C, J)`` to ``(C, B, N)``."""
-    scaled = torch.einsum("bnj,cj->cbn", distances, relevance.square())
-    root = (3 * scaled + 1e-12).sqrt()
+def matern(squares: Tensor) -> Tensor:
+    """The Matérn kernel of order 3/2 of squared distances."""
+    root = (3 * squares + 1e-12).sqrt()
     return (1 + root) * torch.exp(-root)
 
 
@@ -171,20 +170,22 @@ def fold_numbers(frames: int) -> Tensor:
 
 
 @torch.enable_grad()
-def fit_kernels(distances: Tensor, products: Tensor, folds: Tensor) -> tuple[Tensor, Tensor]:
+def fit_kernels(poses: Tensor, products: Tensor, folds: Tensor) -> tuple[Tensor, Tensor]:
     """Relevance ``(C, J)`` and noise ``(C,)`` of each group's kernel, by the error of the folds ``(N,)`` left out.
 
-    ``distances (N, N, J)`` are squared and joint by joint; ``products (C, N, N)`` are y y^T of the groups' targets,
-    means over their columns, square metres.
+    ``poses (N, J, 9)`` are pose features; ``products (C, N, N)`` are y y^T of the groups' targets, means over their
+    columns, square metres.
     """
-    groups, parts = len(products), fold_members(folds)
-    logs = torch.cat([torch.full((groups, distances.shape[-1]), -2.0), torch.full((groups, 1), -4.0)], dim=1)
+    (count, joints, _), groups, parts = poses.shape, len(products), fold_members(folds)
+    logs = torch.cat([torch.full((groups, joints), -2.0), torch.full((groups, 1), -4.0)], dim=1)
     logs = logs.double().requires_grad_()
-    identity = torch.eye(len(distances), dtype=torch.float64)
+    squares = (poses[:, None] - poses).square().sum(dim=-1).flatten(0, 1)  # joint by joint
+    identity = torch.eye(count, dtype=torch.float64)
     optimiser = torch.optim.Adam([logs], lr=FIT_RATE)
     for _ in range(FIT_STEPS if len(folds.unique()) > 2 else 0):
         relevance, noise = logs[:, :-1].exp(), logs[:, -1].exp() + JITTER
-        inverse = torch.linalg.inv(matern(distances, relevance) + noise[:, None, None] * identity)
+        kernels = matern((relevance.square() @ squares.T).unflatten(1, (count, count)))
+        inverse = torch.linalg.inv(kernels + noise[:, None, None] * identity)
         error = 3 * left_out_error(inverse, products, parts) / len(folds)
         loss = ((error + TOLERANCE).log() + PRICE * relevance.sum(dim=1)).sum()
         optimiser.zero_grad()

@@ -14,8 +14,8 @@ from avatar.nn.handles import (
     fold_numbers,
     left_out_error,
     matern,
+    pose_distances,
     pose_features,
-    squared_distances,
 )
 
 
@@ -85,7 +85,7 @@ def test_poses_are_seen_without_heading_and_with_gravity_where_it_is_asked_for()
 def test_frames_left_out_are_missed_as_by_a_regression_without_them():
     poses = pose_features(joint_transforms(np.random.default_rng(0).uniform(-1, 1, (9, 2))), True).double()
     targets = torch.randn(9, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    kernel = matern(squared_distances(poses, poses), torch.full((1, 3), 0.4, dtype=torch.float64))[0]
+    kernel = matern(pose_distances(poses, poses, torch.full((1, 3), 0.4, dtype=torch.float64)))[0]
     kernel = kernel + 0.05 * torch.eye(9)
     parts = [torch.tensor([0, 5]), torch.tensor([1, 2, 8]), torch.tensor([3, 4]), torch.tensor([6, 7])]
     folds = torch.tensor([0, 1, 1, 2, 2, 0, 3, 3, 1])
@@ -97,6 +97,13 @@ def test_frames_left_out_are_missed_as_by_a_regression_without_them():
     inverse, products = torch.linalg.inv(kernel), targets @ targets.T
     found = left_out_error(torch.stack([inverse, inverse]), torch.stack([products, 4 * products]), fold_members(folds))
     assert found.tolist() == pytest.approx([expected, 4 * expected], rel=1e-9)
+
+
+def test_poses_are_as_far_apart_as_their_relevant_joints():
+    one, other = (torch.randn(count, 3, 9, generator=torch.Generator().manual_seed(count)) for count in (4, 5))
+    relevance = torch.tensor([[1.0, 0, 0], [0.5, 2, 1]])
+    expected = torch.einsum("cj,bnj->cbn", relevance.square(), (one[:, None] - other).square().sum(dim=-1))
+    torch.testing.assert_close(pose_distances(one, other, relevance), expected)
 
 
 def test_neighbours_in_time_are_left_out_together():
