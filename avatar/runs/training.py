@@ -15,6 +15,7 @@ from avatar.body.packed import read_template, write_template
 from avatar.checks import AvatarError, DataError
 from avatar.data.batches import FrameDataset, name_frames
 from avatar.data.layouts import find_outfit
+from avatar.data.splits import SplitConfig
 from avatar.environment import choose_device, prepared_process
 from avatar.io.checkpoints import building, load_checkpoint, read_weights, write_weights
 from avatar.io.documents import read_yaml
@@ -134,7 +135,8 @@ def fit_outfit(config: FitConfig) -> Path:
     code = avatar.method.fit_code(avatar, batch, config)
     choice = replace(avatar.config.method, variant=f"{avatar.config.method.variant}-fitted")
     same = {option: getattr(config, option) for option in ("dataset", "name", "data_root", "runs_root")}
-    fitted = replace(avatar.config, method=choice, outfit=(config.outfit,), **same)
+    nothing_held_back = SplitConfig(validation_share=0.0)
+    fitted = replace(avatar.config, method=choice, outfit=(config.outfit,), split=nothing_held_back, **same)
     save_settings(fitted)
     write_template(fitted.folder / "template.npz", avatar.template)
     facts = {"config": settings_to_dict(fitted), "steps": config.steps, "seconds": 0.0, "fitted_to": frame}

@@ -1,5 +1,6 @@
 """An unseen outfit: only its code is learned, and it comes nearer to the scan than the mean outfit."""
 
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -15,12 +16,15 @@ from avatar.data.layouts import find_outfit
 from avatar.data.splits import SplitConfig
 from avatar.geometry.surface import sample_surface
 from avatar.io.checkpoints import read_weights
+from avatar.io.frames import write_manifest
 from avatar.methods import points
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.closet import Closet, ClosetAvatar, Skinning
 from avatar.methods.losses import LossConfig, point_avatar_loss
 from avatar.methods.points import body_batch, predict, template_samples
 from avatar.methods.settings import FitConfig, MethodChoice, RunConfig
+from avatar.pipeline.scores import PredictConfig
+from avatar.pipeline.scores import predict as predict_run
 from avatar.runs.training import WEIGHTS, fit_outfit, load_avatar
 from avatar.runs.training import train as train_run
 
@@ -126,6 +130,19 @@ def test_an_unseen_outfit_is_fitted_from_one_scan_and_comes_nearer_in_unseen_pos
     codes = base.model.codes.detach()
     tight, start = (error(base, code) for code in (codes[0], codes.mean(dim=0)))
     assert error(fitted, fitted.model.codes[0].detach()) < 0.5 * min(tight, start)
+
+
+def test_an_outfit_of_one_scan_is_fitted_and_predicted_by_a_run_that_held_frames_back(settings, garments):
+    single = garments / "open" / "single"
+    shutil.copytree(garments / "open" / "unseen", single)
+    for path in sorted((single / "train").glob("*.npz"))[1:]:
+        path.unlink()
+    write_manifest(single)
+    base = replace(load_avatar(settings.run).config, name="held", split=SplitConfig(0.2))
+    run = train_run(replace(base, train=replace(base.train, steps=2)))
+    fitted = fit_outfit(replace(settings, run=run, outfit="single", steps=2, name="single"))
+    (folder,) = predict_run(PredictConfig(run=fitted, points=1000, data_root=garments))
+    assert len(list(folder.glob("*.ply"))) == 3
 
 
 def test_another_subject_s_field_is_not_fitted():
