@@ -7,25 +7,27 @@ how a texture becomes finer than one scan's points are apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Self
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
 from avatar.checks import AvatarError, check_faces, check_shape, require
+from avatar.geometry.closest import closest_on_mesh, closest_on_triangles
 from avatar.geometry.laplacians import smooth_votes
 from avatar.geometry.surface import vertex_normals
 from avatar.geometry.trees import build_tree
-from avatar.records import ClothedTemplate, Scan
+from avatar.records import ClothedTemplate, Mesh, Scan
 
 LARGEST = 4096  # texels along a side of an image
 PADDING = 4  # texels around a chart that continue its colours, for whoever samples between texels or makes mipmaps
 NEIGHBOURS = 4  # scan points that a texel takes colours from, of each frame
 SIGMA = 0.4  # of the spacing of a scan's points: distance at which a point's weight is 1 / e of the nearest one's
 FACING = 0.5  # least cosine between the normals of texel and point
-AGREEMENT = 0.15  # of colours in [0, 1]: root mean square difference from the first mean at which a weight is 1 / e
+SMOOTH = 0.002  # metres over which colours of vertices are smoothed before they are continued
 CHUNK = 1 << 18  # texels searched for at once
 INSIDE = -1e-6  # barycentric coordinates from which on a texel's centre counts as inside
 
@@ -52,6 +54,10 @@ class Places:
     def on(self, values: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Values ``(V, C)`` of a mesh's vertices at the places, ``(T, C)``."""
         return np.einsum("tk,tkc->tc", self.barycentric, values[faces[self.face_ids]])
+
+    def some(self, rows: np.ndarray) -> Places:
+        """Some of the places, by index."""
+        return Places(self.face_ids[rows], self.barycentric[rows])
 
 
 @dataclass(frozen=True)
@@ -155,64 +161,202 @@ def vertex_places(faces: np.ndarray, count: int) -> Places:
     return Places(first // 3, np.eye(3, dtype=np.float32)[first % 3])
 
 
-@dataclass
-class ColorSums:
-    """Weighted sums of the colours seen at places of a mesh, frame by frame: ``sums (T, 3)``, ``weights (T,)``.
-
-    A point's weight falls with its distance from the place along the surface, ``exp(-(d / sigma)^2)``, where sigma is
-    `SIGMA` of the spacing of the scan's points: so sharp that a place's colour is that of the points next to it, of
-    whichever frames had them. With ``reference (T, 3)``, colours of a first pass, it also falls with the difference
-    from those, so that what most frames say outweighs the rest.
+@dataclass(frozen=True)
+class SeenColors:
+    """Colours ``(T, 3)`` float32 in [0, 1] at places of a mesh, zero where none was seen; ``frames (T,)`` which of the
+    frames, in the order they were looked at, showed each, -1 for none.
     """
 
-    places: Places
-    faces: np.ndarray
-    reach: float  # metres, from place to point
-    sigma: float = SIGMA
-    reference: np.ndarray | None = None
-    sums: np.ndarray = field(init=False)
-    weights: np.ndarray = field(init=False)
-
-    def __post_init__(self):
-        count = len(self.places.face_ids)
-        self.sums, self.weights = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
-
-    def add(self, vertices: np.ndarray, scan: Scan) -> Self:
-        """Adds what a coloured scan shows of the mesh's vertices ``(V, 3)`` in its pose."""
-        dims = check_shape("points", scan.points, "M 3")
-        check_shape("colors", scan.colors, "M 3", **dims)
-        tree, sigma = build_tree(scan.points), self.sigma * point_spacing(scan.points)
-        normals = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(self.faces)).numpy()
-        count, colors = min(NEIGHBOURS, dims["M"]), np.asarray(scan.colors, np.float32)
-        for start in range(0, len(self.weights), CHUNK):
-            rows = slice(start, start + CHUNK)
-            places = Places(self.places.face_ids[rows], self.places.barycentric[rows])
-            points, facing = places.on(vertices, self.faces), places.on(normals, self.faces)
-            facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
-            distances, ids = tree.query(points, k=np.arange(1, count + 1), distance_upper_bound=self.reach)
-            seen = np.flatnonzero(np.isfinite(distances[:, 0]))
-            distances, ids = distances[seen], np.where(np.isfinite(distances[seen]), ids[seen], 0)
-            aside = np.einsum("nkc,nc->nk", scan.points[ids] - points[seen, None], facing[seen])
-            squared = np.maximum(distances**2 - aside**2, 0)
-            weights = np.exp(-squared / sigma**2) + 1e-20 * (distances <= self.reach)
-            weights *= np.isfinite(distances)
-            weights *= np.einsum("nkc,nc->nk", scan.normals[ids], facing[seen]) > FACING
-            if self.reference is not None:
-                away = np.square(colors[ids] - self.reference[rows][seen][:, None]).mean(axis=2)
-                weights *= np.exp(-away / AGREEMENT**2) + 1e-6
-            self.sums[start + seen] += np.einsum("nk,nkc->nc", weights, colors[ids])
-            self.weights[start + seen] += weights.sum(axis=1)
-        return self
+    colors: np.ndarray
+    frames: np.ndarray
 
     @property
     def seen(self) -> np.ndarray:
-        """Which places ``(T,)`` some scan has shown, bool."""
-        return self.weights > 0
+        """Which places ``(T,)`` some frame has shown, bool."""
+        return self.frames >= 0
 
-    @property
-    def colors(self) -> np.ndarray:
-        """The mean colours ``(T, 3)`` in [0, 1]; zero where none was seen."""
-        return self.sums / np.maximum(self.weights, 1e-30)[:, None] * self.seen[:, None]
+
+def bake(places: Places, faces: np.ndarray, shown: Iterable[tuple[np.ndarray, Scan]], reach: float) -> SeenColors:
+    """Colours of places on a mesh from coloured scans: each place takes those of the first frame that shows it.
+
+    A mesh follows cloth along its normals and not along itself: from frame to frame cloth slides by centimetres below
+    it, and a mean over frames has no small figures left. One frame has them all, in their places; those after it fill
+    what it did not see. So the order matters: the frame that fits best comes first.
+
+    Args:
+        places: where.
+        faces: ``(F, 3)`` of the mesh.
+        shown: vertices ``(V, 3)``, metres, and the coloured scan of each frame; asked for one at a time.
+        reach: metres from a place to the points that it takes colours from.
+
+    Raises:
+        AvatarError: for a scan without colours, or of fewer than two points.
+    """
+    count = len(places.face_ids)
+    colors, frames = np.zeros((count, 3), np.float32), np.full(count, -1, np.int64)
+    for number, (vertices, scan) in enumerate(shown):
+        left = np.flatnonzero(frames < 0)
+        if not len(left):
+            break
+        mean, weights = mean_colors(places.some(left), faces, vertices, scan, reach)
+        found = weights > 0
+        colors[left[found]], frames[left[found]] = mean[found], number
+    return SeenColors(colors, frames)
+
+
+def mean_colors(
+    places: Places, faces: np.ndarray, vertices: np.ndarray, scan: Scan, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours ``(T, 3)`` of the `NEIGHBOURS` points of a scan nearest to each place, and the sum ``(T,)`` of weights.
+
+    A point's weight falls with its distance along the surface, ``exp(-(d / sigma)^2)``, where sigma is `SIGMA` of the
+    spacing of the scan's points: the nearest point decides, and borders between two points are smooth. Points on
+    another side (`FACING`) and those beyond ``reach`` have none.
+    """
+    dims = check_shape("points", scan.points, "M 3")
+    if scan.colors is None:
+        raise AvatarError("scan: expected one with colours, got none.")
+    check_shape("colors", scan.colors, "M 3", **dims)
+    tree, sigma = build_tree(scan.points), SIGMA * point_spacing(scan.points)
+    normals = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(faces)).numpy()
+    found, sums = np.zeros((len(places.face_ids), 3), np.float32), np.zeros(len(places.face_ids), np.float32)
+    nearest = np.arange(1, min(NEIGHBOURS, dims["M"]) + 1)
+    for start in range(0, len(sums), CHUNK):
+        rows = np.arange(start, min(start + CHUNK, len(sums)))
+        points, facing = places.some(rows).on(vertices, faces), places.some(rows).on(normals, faces)
+        distances, ids = tree.query(points, k=nearest, distance_upper_bound=reach)
+        near = np.isfinite(distances[:, 0])
+        rows, points, facing, distances, ids = (part[near] for part in (rows, points, facing, distances, ids))
+        there = np.isfinite(distances)
+        ids = np.where(there, ids, 0)
+        facing = facing / np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
+        away = scan.points[ids] - points[:, None]
+        squared = np.maximum(np.square(away).sum(axis=2) - np.einsum("nkc,nc->nk", away, facing) ** 2, 0)
+        there &= np.einsum("nkc,nc->nk", scan.normals[ids], facing) > FACING
+        weights = there * np.maximum(np.exp(-(squared - squared[:, :1]) / sigma**2).clip(max=1e6), 1e-12)
+        sums[rows] = weights.sum(axis=1)
+        mixed = np.einsum("nk,nkc->nc", weights, np.asarray(scan.colors, np.float64)[ids])
+        found[rows] = mixed / np.maximum(sums[rows], 1e-30)[:, None]
+    return np.clip(found, 0, 1), sums
+
+
+def fit_distance(vertices: np.ndarray, scan: Scan, far: float) -> float:
+    """The mean distance from a mesh's vertices to the scan's points, each counted to ``far`` at most, metres."""
+    distances, _ = build_tree(scan.points).query(vertices, distance_upper_bound=far)
+    return float(np.minimum(distances, far).mean())
+
+
+def fill_unseen(
+    places: Places, colors: np.ndarray, seen: np.ndarray, vertices: np.ndarray, faces: np.ndarray, fixed: np.ndarray
+) -> np.ndarray:
+    """Colours ``(T, 3)`` at all places: those that were not seen take what is around them on the surface, smoothly.
+
+    Vertices near seen places take their mean colours, the others continue them over the surface; a connected part
+    ``faces (F, 3)`` of which nothing was seen has the mean colour of its kind ``fixed (F,)`` (bool, such as garment),
+    or else of all. Raises `AvatarError` where nothing at all was seen.
+    """
+    if not seen.any():
+        raise AvatarError("scans: expected some to show the mesh, none does. Hint: a larger reach=...")
+    rest = np.flatnonzero(~seen)
+    if not len(rest):
+        return colors
+    some = places.some(np.flatnonzero(seen))
+    corners, shares = faces[some.face_ids].reshape(-1), some.barycentric.reshape(-1)
+    total = np.bincount(corners, shares, len(vertices))
+    confidence = np.minimum(total, 1.0)
+    means = np.empty((len(vertices), 3))
+    for channel in range(3):
+        sums = np.bincount(corners, shares * colors[seen][:, channel].repeat(3), len(vertices))
+        mean = sums / np.maximum(total, 1e-12)
+        means[:, channel] = smooth_votes(vertices, faces, mean, confidence, SMOOTH)
+    kinds = fixed[places.face_ids]
+    for kind in (False, True):
+        alike = colors[seen & (kinds == kind)] if (seen & (kinds == kind)).any() else colors[seen]
+        mine = np.unique(faces[fixed == kind])
+        mine = mine[np.isnan(means[mine]).any(axis=1)]
+        means[mine] = alike.mean(axis=0)
+    filled = colors.copy()
+    filled[rest] = places.some(rest).on(np.nan_to_num(means).clip(0, 1).astype(np.float32), faces)
+    return filled
+
+
+def paint_image(texels: TexelMap, colors: np.ndarray) -> np.ndarray:
+    """The image ``(H, W, 3)`` uint8 of colours ``(T, 3)`` in [0, 1] of texels, continued around the charts.
+
+    Texels within twice `PADDING` of a chart take the colour of its nearest texel, so that what samples between texels,
+    or halves the image once, sees no background; the rest has the mean colour.
+    """
+    height, width = texels.shape
+    image = np.empty((height, width, 3), np.uint8)
+    image[:] = np.rint(colors.mean(axis=0) * 255)
+    empty = np.ones((height, width), bool)
+    empty.flat[texels.texels] = False
+    image.reshape(-1, 3)[texels.texels] = np.rint(np.clip(colors, 0, 1) * 255)
+    distance, (rows, columns) = distance_transform_edt(empty, return_indices=True)
+    around = empty & (distance <= 2 * PADDING)
+    image[around] = image[rows[around], columns[around]]
+    return image
+
+
+def sample_image(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Colours ``(N, 3)`` in [0, 1] of an image ``(H, W, 3)`` uint8 at coordinates ``(N, 2)``, v upwards, bilinear."""
+    height, width = image.shape[:2]
+    column, row = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
+    across, down = (column - left)[:, None], (row - top)[:, None]
+
+    def at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(np.float64) / 255
+
+    upper = at(left, top) * (1 - across) + at(left + 1, top) * across
+    lower = at(left, top + 1) * (1 - across) + at(left + 1, top + 1) * across
+    return upper * (1 - down) + lower * down
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """An image ``(H, W, 3)`` uint8 as the bytes of a PNG file; equal images, equal bytes."""
+    encoded = io.BytesIO()
+    require("PIL.Image").fromarray(image).save(encoded, format="PNG", optimize=True)
+    return encoded.getvalue()
+
+
+def points_on_mesh(scan: Scan, vertices: np.ndarray, faces: np.ndarray, near: float) -> tuple[Places, np.ndarray]:
+    """The places on a mesh that are nearest to a scan's points, and the points' index ``(K,)``.
+
+    Points farther than ``near`` metres, or that look another way than the mesh, are left out.
+    """
+    hits = closest_on_mesh(scan.points, vertices, faces, near)
+    corners = np.asarray(vertices, np.float64)[faces[hits.face_ids]]
+    _, barycentric = closest_on_triangles(hits.points, corners)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    kept = np.abs(hits.signed_distances) < near
+    kept &= np.einsum("nc,nc->n", normals, scan.normals) > FACING
+    return Places(hits.face_ids[kept], barycentric[kept]), np.flatnonzero(kept)
+
+
+def fine_mesh(mesh: Mesh, unwrapped: Unwrapped, image: np.ndarray, shown: np.ndarray, parts: int = 6) -> Mesh:
+    """The faces ``shown`` of a mesh cut into ``parts ** 2`` triangles each, whose vertices have the texture's colours.
+
+    It shows a texture where vertex colours alone can be drawn; triangles share no vertices.
+    """
+    faces = np.flatnonzero(shown)
+    first, second = (grid.reshape(-1) for grid in np.meshgrid(*[np.arange(parts + 1)] * 2, indexing="ij"))
+    kept = first + second <= parts
+    first, second = first[kept], second[kept]
+    weights = np.stack([parts - first - second, first, second], axis=1) / parts
+    number = {place: index for index, place in enumerate(zip(first.tolist(), second.tolist()))}
+    small = []
+    for a, b in number:
+        if a + b < parts:
+            small.append((number[a, b], number[a + 1, b], number[a, b + 1]))
+        if a + b < parts - 1:
+            small.append((number[a + 1, b], number[a + 1, b + 1], number[a, b + 1]))
+    points = np.einsum("pk,fkc->fpc", weights, np.asarray(mesh.vertices, np.float64)[mesh.faces[faces]])
+    uv = np.einsum("pk,fkc->fpc", weights, unwrapped.uv[unwrapped.uv_faces[faces]].astype(np.float64))
+    corners = np.array(small)[None] + (np.arange(len(faces)) * len(weights))[:, None, None]
+    colors = sample_image(image, uv.reshape(-1, 2))
+    return Mesh(points.reshape(-1, 3).astype(np.float32), corners.reshape(-1, 3), colors.astype(np.float32))
 
 
 def point_spacing(points: np.ndarray) -> float:
