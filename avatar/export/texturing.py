@@ -1,8 +1,7 @@
 """Textures of meshes of constant topology: a UV atlas, the place on the mesh of each texel, and colours from scans.
 
-A texel is a place on the mesh (face and barycentric coordinates), so it is found again on the mesh in any pose. There it
-takes the colours of the nearest points of that frame's scan; points of many frames fall between one another, which is
-how a texture becomes finer than one scan's points are apart.
+A texel is a place on the mesh (face and barycentric coordinates), so it is found again on the mesh in any pose,
+where it takes the colours of that frame's nearest scan points.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 import torch
@@ -24,12 +24,22 @@ from avatar.records import ClothedTemplate, Mesh, Scan
 
 LARGEST = 4096  # texels along a side of an image
 PADDING = 4  # texels around a chart that continue its colours, for whoever samples between texels or makes mipmaps
-NEIGHBOURS = 4  # scan points that a texel takes colours from, of each frame
-SIGMA = 0.4  # of the spacing of a scan's points: distance at which a point's weight is 1 / e of the nearest one's
+NEIGHBOURS = 8  # scan points that a texel takes colours from
+WIDE = 1.5  # spacings of a scan's points along the surface: a texel with none so near was not seen
+SIGMA = 0.6  # of the spacing of a scan's points: distance at which a point's weight is 1 / e of the nearest one's
+ALIKE = 0.1  # root mean square difference of colours in [0, 1] at which a point's weight is 1 / e of an equal one's
+ROUNDS = 2  # of weighing by colour
 FACING = 0.5  # least cosine between the normals of texel and point
 SMOOTH = 0.002  # metres over which colours of vertices are smoothed before they are continued
-CHUNK = 1 << 18  # texels searched for at once
+CHUNK = 1 << 16  # texels searched for at once
 INSIDE = -1e-6  # barycentric coordinates from which on a texel's centre counts as inside
+
+
+class Blend(Enum):
+    """What a texel takes of the frames that show it."""
+
+    first = "first"  # the colours of the one that fits best: small figures stay
+    mean = "mean"  # the mean over all, which blurs what slides below the mesh
 
 
 @dataclass(frozen=True)
@@ -121,7 +131,7 @@ def map_texels(unwrapped: Unwrapped, shown: np.ndarray) -> TexelMap:
     high = np.minimum(np.ceil(corners.max(axis=1) - 0.5).astype(np.int64), (width - 1, height - 1))
     wide, tall = (high - low + 1).clip(min=0).T
     counts = wide * tall
-    for part in np.array_split(np.arange(len(face_ids)), 1 + int(counts.sum()) // (CHUNK * 4)):
+    for part in np.array_split(np.arange(len(face_ids)), 1 + int(counts.sum()) // (16 * CHUNK)):
         which = np.repeat(part, counts[part])
         inner = np.arange(len(which)) - np.repeat(np.cumsum(counts[part]) - counts[part], counts[part])
         columns = low[which, 0] + inner % wide[which]
@@ -176,8 +186,14 @@ class SeenColors:
         return self.frames >= 0
 
 
-def bake(places: Places, faces: np.ndarray, shown: Iterable[tuple[np.ndarray, Scan]], reach: float) -> SeenColors:
-    """Colours of places on a mesh from coloured scans: each place takes those of the first frame that shows it.
+def bake(
+    places: Places,
+    faces: np.ndarray,
+    shown: Iterable[tuple[np.ndarray, Scan]],
+    reach: float,
+    blend: Blend = Blend.first,
+) -> SeenColors:
+    """Colours of places on a mesh from coloured scans, by default those of the first frame that shows each place.
 
     A mesh follows cloth along its normals and not along itself: from frame to frame cloth slides by centimetres below
     it, and a mean over frames has no small figures left. One frame has them all, in their places; those after it fill
@@ -188,19 +204,23 @@ def bake(places: Places, faces: np.ndarray, shown: Iterable[tuple[np.ndarray, Sc
         faces: ``(F, 3)`` of the mesh.
         shown: vertices ``(V, 3)``, metres, and the coloured scan of each frame; asked for one at a time.
         reach: metres from a place to the points that it takes colours from.
+        blend: the first frame that shows a place, or the mean over all.
 
     Raises:
         AvatarError: for a scan without colours, or of fewer than two points.
     """
     count = len(places.face_ids)
     colors, frames = np.zeros((count, 3), np.float32), np.full(count, -1, np.int64)
+    total = np.zeros(count, np.float32)
     for number, (vertices, scan) in enumerate(shown):
-        left = np.flatnonzero(frames < 0)
-        if not len(left):
+        wanted = np.flatnonzero(frames < 0) if blend is Blend.first else np.arange(count)
+        if not len(wanted):
             break
-        mean, weights = mean_colors(places.some(left), faces, vertices, scan, reach)
-        found = weights > 0
-        colors[left[found]], frames[left[found]] = mean[found], number
+        found, weights = mean_colors(places.some(wanted), faces, vertices, scan, reach)
+        wanted, found, weights = (part[weights > 0] for part in (wanted, found, weights))
+        total[wanted] += weights
+        colors[wanted] += (found - colors[wanted]) * (weights / total[wanted])[:, None]
+        frames[wanted] = np.where(frames[wanted] < 0, number, frames[wanted])
     return SeenColors(colors, frames)
 
 
@@ -209,15 +229,18 @@ def mean_colors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours ``(T, 3)`` of the `NEIGHBOURS` points of a scan nearest to each place, and the sum ``(T,)`` of weights.
 
-    A point's weight falls with its distance along the surface, ``exp(-(d / sigma)^2)``, where sigma is `SIGMA` of the
-    spacing of the scan's points: the nearest point decides, and borders between two points are smooth. Points on
-    another side (`FACING`) and those beyond ``reach`` have none.
+    A bilateral mean (Tomasi and Manduchi 1998): a point's weight falls with its distance along the surface,
+    ``exp(-(d / sigma)^2)``, where sigma is `SIGMA` of the spacing of the scan's points, and with the difference of its
+    colour from the mean so far, ``exp(-(c / ALIKE)^2)``. So a place at a border between two colours has that of more
+    points near it, not one between. Points on another side (`FACING`), beyond ``reach`` or beyond `WIDE` spacings along
+    the surface have none.
     """
     dims = check_shape("points", scan.points, "M 3")
     if scan.colors is None:
         raise AvatarError("scan: expected one with colours, got none.")
     check_shape("colors", scan.colors, "M 3", **dims)
-    tree, sigma = build_tree(scan.points), SIGMA * point_spacing(scan.points)
+    tree, spacing = build_tree(scan.points), point_spacing(scan.points)
+    sigma, wide = SIGMA * spacing, WIDE * spacing
     normals = vertex_normals(torch.as_tensor(vertices), torch.as_tensor(faces)).numpy()
     found, sums = np.zeros((len(places.face_ids), 3), np.float32), np.zeros(len(places.face_ids), np.float32)
     nearest = np.arange(1, min(NEIGHBOURS, dims["M"]) + 1)
@@ -232,12 +255,22 @@ def mean_colors(
         facing = facing / np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-12)
         away = scan.points[ids] - points[:, None]
         squared = np.maximum(np.square(away).sum(axis=2) - np.einsum("nkc,nc->nk", away, facing) ** 2, 0)
-        there &= np.einsum("nkc,nc->nk", scan.normals[ids], facing) > FACING
+        there &= (np.einsum("nkc,nc->nk", scan.normals[ids], facing) > FACING) & (squared < wide**2)
         weights = there * np.maximum(np.exp(-(squared - squared[:, :1]) / sigma**2).clip(max=1e6), 1e-12)
         sums[rows] = weights.sum(axis=1)
-        mixed = np.einsum("nk,nkc->nc", weights, np.asarray(scan.colors, np.float64)[ids])
-        found[rows] = mixed / np.maximum(sums[rows], 1e-30)[:, None]
+        found[rows] = bilateral_mean(np.asarray(scan.colors, np.float64)[ids], weights)
     return np.clip(found, 0, 1), sums
+
+
+def bilateral_mean(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The mean ``(N, 3)`` of colours ``(N, K, 3)`` with weights ``(N, K)`` that fall with the difference from it."""
+    alike = weights
+    for turn in range(ROUNDS + 1):
+        mean = np.einsum("nk,nkc->nc", alike, colors) / np.maximum(alike.sum(axis=1), 1e-30)[:, None]
+        if turn < ROUNDS:
+            away = np.square(colors - mean[:, None]).mean(axis=2)
+            alike = weights * np.maximum(np.exp(-away / ALIKE**2), 1e-9)
+    return mean
 
 
 def fit_distance(vertices: np.ndarray, scan: Scan, far: float) -> float:
