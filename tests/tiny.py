@@ -14,7 +14,7 @@ from avatar.geometry.transforms import transform_directions, transform_points
 from avatar.io.frames import OpenFrame, OpenGarment, write_manifest, write_open_frame, write_open_garment
 from avatar.methods.losses import LossConfig
 from avatar.methods.settings import Schedule, TrainConfig
-from avatar.records import CanonicalScan
+from avatar.records import CanonicalScan, ClothedTemplate, Template
 from avatar.simulate.angles import pose_from_angles
 
 HIERARCHY = {"points": [256, 64], "radii": [0.3, 1.0], "neighbours": 16}
@@ -95,3 +95,21 @@ def canonical_truth(outfit: OpenOutfit, split: str, name: str) -> CanonicalScan:
     ids = nearest(points[None], template.vertices[None])[0]
     normals = vertex_normals(template.vertices, template.faces)[ids].numpy()
     return CanonicalScan(scan.canonical, normals, template.weights[ids].numpy(), np.arange(len(points)))
+
+
+def trunk_garment(template: Template) -> ClothedTemplate:
+    """A clothed template made by hand: the trunk, pushed out by 2 cm, as garment over the body's other skin."""
+    names = [template.joint_names.index(name) for name in ("pelvis", "spine1", "spine2", "spine3")]
+    trunk = (template.weights[:, names].sum(dim=1) > 0.5).numpy()
+    vertices, faces = template.vertices.numpy(), template.faces.numpy()
+    pushed = vertices + 0.02 * vertex_normals(template.vertices, template.faces).numpy()
+    (skin, low), (top, high) = (
+        np.unique(faces[part], return_inverse=True) for part in (~trunk[faces].all(axis=1), trunk[faces].all(axis=1))
+    )
+    return ClothedTemplate(
+        vertices=np.concatenate([vertices[skin], pushed[top]]),
+        faces=np.concatenate([low.reshape(-1, 3), high.reshape(-1, 3) + len(skin)]),
+        weights=np.concatenate([template.weights.numpy()[rows] for rows in (skin, top)]),
+        body_vertex=np.concatenate([skin, np.full(len(top), -1)]),
+        covered=np.zeros(len(skin) + len(top), bool),
+    )

@@ -195,18 +195,21 @@ def measure(
 
     Of test frames and, where the true surface is known, of a fresh sampling of the ``first`` frame, in which nothing
     has moved: that error is of sharpness alone. ``texture`` beside ``vertices``, colours baked likewise at the mesh's
-    vertices, and ``nearest``, the nearest point of the first frame's scan. ``contrast`` is the spread of the colours
-    on the garment, as a share of the scans'.
+    vertices, ``nearest``, the nearest point of the first frame's scan, and ``flat``, the median colour of skin and of
+    garment. The contrast is the spread of the colours on the garment, as a share of the scans'.
     """
     clothed, outfit = opened.clothed, opened.outfit
     vertices, scan = opened.load("train", first)
     places = vertex_places(clothed.faces, len(clothed.vertices))
     seen = bake(places, clothed.faces, [(vertices, scan)], config.reach)
     baked, tree = filled_colors(places, seen, clothed), build_tree(scan.points)
+    kinds = clothed.garment_faces[places.face_ids]
+    flat = np.stack([np.median(baked[kinds == kind] if (kinds == kind).any() else baked, axis=0) for kind in (0, 1)])
     ways: dict[str, Callable[[Places], np.ndarray]] = {
         "texture": lambda at: sample_image(image, at.on(unwrapped.uv, unwrapped.uv_faces)),
         "vertices": lambda at: at.on(baked, clothed.faces),
         "nearest": lambda at: scan.colors[tree.query(at.on(vertices, clothed.faces))[1]],
+        "flat": lambda at: flat[clothed.garment_faces[at.face_ids].astype(np.int64)],
     }
     sets = {"test": [opened.load("test", name) for name in tested]}
     if isinstance(outfit, OpenOutfit):

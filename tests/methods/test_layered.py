@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from spheres import DECODER, ENCODER, TEMPLATE, random_batch
-from tiny import SETTINGS, quick_training
+from tiny import SETTINGS, quick_training, trunk_garment
 
 from avatar.body.packed import write_template
 from avatar.checks import AvatarError, DataError
@@ -253,20 +253,7 @@ def run(tiny_folder, tiny_outfit, tmp_path_factory) -> RunConfig:
     """A run on the tiny outfit, whose clothed template is made by hand: the trunk as garment over the body's skin."""
     runs = tmp_path_factory.mktemp("runs")
     template = tiny_outfit.template
-    names = [template.joint_names.index(name) for name in ("pelvis", "spine1", "spine2", "spine3")]
-    trunk = (template.weights[:, names].sum(dim=1) > 0.5).numpy()
-    vertices, faces = template.vertices.numpy(), template.faces.numpy()
-    pushed = vertices + 0.02 * vertex_normals(template.vertices, template.faces).numpy()
-    (skin, low), (top, high) = (
-        np.unique(faces[part], return_inverse=True) for part in (~trunk[faces].all(axis=1), trunk[faces].all(axis=1))
-    )
-    clothed = ClothedTemplate(
-        vertices=np.concatenate([vertices[skin], pushed[top]]),
-        faces=np.concatenate([low.reshape(-1, 3), high.reshape(-1, 3) + len(skin)]),
-        weights=np.concatenate([template.weights.numpy()[rows] for rows in (skin, top)]),
-        body_vertex=np.concatenate([skin, np.full(len(top), -1)]),
-        covered=np.zeros(len(skin) + len(top), bool),
-    )
+    clothed = trunk_garment(template)
     train = quick_training(steps=100, points=2000, scan_points=2000, validate_every=50, save_every=50)
     train = replace(train, schedule=Schedule.constant, loss=replace(train.loss, normal_start=0.0))  # no end to see
     choice = MethodChoice("layered", "layered", SETTINGS)
