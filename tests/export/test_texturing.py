@@ -62,8 +62,8 @@ TEXELS = map_texels(UNWRAPPED, CLOTHED.visible_faces)
 
 
 def pattern(points: np.ndarray) -> np.ndarray:
-    """Checks of 8 cm: vertices are 7 cm apart."""
-    odd = np.floor(points / 0.08).sum(axis=1) % 2 == 1
+    """Upright stripes, 8 cm wide before and behind: vertices are 7 cm apart."""
+    odd = np.floor(points[:, 0] / 0.08) % 2 == 1
     return np.where(odd[:, None], RED, WHITE)
 
 
@@ -152,7 +152,7 @@ def test_a_pattern_comes_back_sharper_than_from_vertices():
     baked = bake(vertices, CLOTHED.faces, [(CLOTHED.vertices, scan())], 0.03)
     assert baked.seen.mean() > 0.99
     per_vertex = errors(lambda at: at.on(baked.colors, CLOTHED.faces))
-    assert textured < 0.05 and per_vertex > 4 * textured  # measured: 0.030 and 0.187
+    assert textured < 0.04 and per_vertex > 3.5 * textured  # measured: 0.027 and 0.122, 4.5 times
     fine = fine_mesh(Mesh(CLOTHED.vertices, CLOTHED.faces), UNWRAPPED, image, CLOTHED.visible_faces)
     assert len(fine.faces) == 36 * CLOTHED.visible_faces.sum()
     area = trimesh.triangles.area(fine.vertices[fine.faces].astype(np.float64)).sum()
@@ -174,7 +174,7 @@ def test_the_first_frame_keeps_figures_that_a_mean_over_sliding_frames_loses():
         seen = bake(TEXELS.places, CLOTHED.faces, frames, 0.03, blend)
         image = image_of(seen)
         found[blend] = errors(lambda at, image=image: sample_image(image, at.on(UNWRAPPED.uv, UNWRAPPED.uv_faces)))
-    assert found[Blend.first] < 0.05 and found[Blend.mean] > 3 * found[Blend.first]
+    assert found[Blend.first] < 0.04 and found[Blend.mean] > 3 * found[Blend.first]
 
 
 def test_later_frames_fill_what_the_first_did_not_see():

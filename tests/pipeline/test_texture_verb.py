@@ -59,7 +59,7 @@ def runs(tmp_path_factory) -> dict[str, Path]:
 
 
 def test_runs_that_can_have_no_texture_are_refused_before_anything_is_written(runs):
-    with pytest.raises(DataError, match=r"train/rise.*expected a scan with colours.*Hint|scan\.pattern"):
+    with pytest.raises(DataError, match=r"train/rise.*expected a scan with colours, got none.*scan\.pattern"):
         make_texture(TextureConfig(run=runs["plain"]))
     with pytest.raises(AvatarError, match=r"run: expected a run with a mesh of its own.*method=layered"):
         make_texture(TextureConfig(run=runs["points"]))
