@@ -30,6 +30,9 @@ SIGMA = 0.6  # of the spacing of a scan's points: distance at which a point's we
 ALIKE = 0.1  # root mean square difference of colours in [0, 1] at which a point's weight is 1 / e of an equal one's
 ROUNDS = 2  # of weighing by colour
 FACING = 0.5  # least cosine between the normals of texel and point
+BORDER = 0.05  # metres at rest between skin and garment within which one may have taken colours of the other
+NEARBY = 200  # texels beyond a border that say which colours a part has
+FEW = 0.1  # share of them that does not count
 SMOOTH = 0.002  # metres over which colours of vertices are smoothed before they are continued
 CHUNK = 1 << 16  # texels searched for at once
 INSIDE = -1e-6  # barycentric coordinates from which on a texel's centre counts as inside
@@ -277,6 +280,44 @@ def fit_distance(vertices: np.ndarray, scan: Scan, far: float) -> float:
     """The mean distance from a mesh's vertices to the scan's points, each counted to ``far`` at most, metres."""
     distances, _ = build_tree(scan.points).query(vertices, distance_upper_bound=far)
     return float(np.minimum(distances, far).mean())
+
+
+def drop_mixed_borders(places: Places, seen: SeenColors, clothed: ClothedTemplate) -> SeenColors:
+    """Colours without those that skin took from the garment, or the garment from skin, where the two meet.
+
+    Mesh and scan do not end at the same place, so a collar has points of the neck next to it. A place within `BORDER`
+    of the other part at rest is taken for unseen if its colour is alike (`ALIKE`) to those of the other part beyond its
+    border, and not, but for a few, to those of its own part there. Trimmings of a third colour stay.
+    """
+    points, kinds = places.on(clothed.vertices, clothed.faces), clothed.garment_faces[places.face_ids]
+    if kinds.all() or not kinds.any():
+        return seen
+    trees = {kind: build_tree(points[kinds == kind]) for kind in (False, True)}
+    near = np.zeros(len(points), bool)
+    for kind, tree in trees.items():
+        mine = np.flatnonzero(kinds != kind)
+        near[mine] = np.isfinite(tree.query(points[mine], distance_upper_bound=BORDER)[0])
+    dropped = np.zeros(len(points), bool)
+    mixed = np.flatnonzero(near & seen.seen)
+    for kind in (False, True):
+        own, other = (np.flatnonzero(seen.seen & ~near & (kinds == which)) for which in (kind, not kind))
+        mine = mixed[kinds[mixed] == kind]
+        if len(own) and len(other) and len(mine):
+            shares = [
+                share_alike(points[mine], seen.colors[mine], points[ids], seen.colors[ids]) for ids in (own, other)
+            ]
+            dropped[mine] = (shares[0] < FEW) & (shares[1] > FEW)
+    return SeenColors(seen.colors * ~dropped[:, None], np.where(dropped, -1, seen.frames))
+
+
+def share_alike(points: np.ndarray, colors: np.ndarray, others: np.ndarray, other_colors: np.ndarray) -> np.ndarray:
+    """The share ``(N,)`` of the `NEARBY` other places next to each that have a colour like its own (`ALIKE`)."""
+    tree, nearest, shares = build_tree(others), np.arange(1, min(NEARBY, len(others)) + 1), np.empty(len(points))
+    for rows in np.array_split(np.arange(len(points)), 1 + len(points) * NEARBY // (16 * CHUNK)):
+        _, ids = tree.query(points[rows], k=nearest)
+        away = np.square(other_colors[ids] - colors[rows][:, None]).mean(axis=2)
+        shares[rows] = (away < ALIKE**2).mean(axis=1)
+    return shares
 
 
 def fill_unseen(

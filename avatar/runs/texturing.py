@@ -22,6 +22,7 @@ from avatar.export.texturing import (
     TexelMap,
     Unwrapped,
     bake,
+    drop_mixed_borders,
     encode_png,
     fill_unseen,
     fit_distance,
@@ -159,6 +160,7 @@ def bake_run(config: TextureConfig, opened: Textured, names: list[str], tested: 
         return (opened.load("train", name) for name in tracked(order, "colours"))
 
     seen = bake(texels.places, clothed.faces, shown(), config.reach, config.blend)
+    seen = drop_mixed_borders(texels.places, seen, clothed)
     image = paint_image(texels, filled_colors(texels.places, seen, clothed))
     texture = Texture(clothed.faces, unwrapped.uv, unwrapped.uv_faces, encode_png(image))
     write_texture(folder, texture)
@@ -201,7 +203,7 @@ def measure(
     clothed, outfit = opened.clothed, opened.outfit
     vertices, scan = opened.load("train", first)
     places = vertex_places(clothed.faces, len(clothed.vertices))
-    seen = bake(places, clothed.faces, [(vertices, scan)], config.reach)
+    seen = drop_mixed_borders(places, bake(places, clothed.faces, [(vertices, scan)], config.reach), clothed)
     baked, tree = filled_colors(places, seen, clothed), build_tree(scan.points)
     kinds = clothed.garment_faces[places.face_ids]
     flat = np.stack([np.median(baked[kinds == kind] if (kinds == kind).any() else baked, axis=0) for kind in (0, 1)])

@@ -14,6 +14,7 @@ from avatar.export.texturing import (
     SeenColors,
     bake,
     bilateral_mean,
+    drop_mixed_borders,
     encode_png,
     fill_unseen,
     fine_mesh,
@@ -203,6 +204,42 @@ def test_what_no_scan_saw_is_filled_smoothly_from_around_it():
     assert nothing is colors
     with pytest.raises(AvatarError, match=r"none does\. Hint: a larger reach"):
         fill_unseen(TEXELS.places, colors, np.zeros(len(seen), bool), CLOTHED.vertices, CLOTHED.faces, garment)
+
+
+def meeting_parts() -> ClothedTemplate:
+    """A plane of 40 x 20 cm in quads of 1 cm: the left half skin, the right half garment, side by side."""
+    across, down = np.meshgrid(np.arange(21), np.arange(21), indexing="ij")
+    half = np.stack([across, down, np.zeros_like(down)], axis=2).reshape(-1, 3) / 100
+    corner = (np.arange(20)[:, None] * 21 + np.arange(20)).reshape(-1, 1)
+    faces = np.concatenate([corner + [0, 21, 1], corner + [1, 21, 22]])
+    count = len(half)
+    return ClothedTemplate(
+        vertices=np.concatenate([half - [0.2, 0, 0], half]).astype(np.float32),
+        faces=np.concatenate([faces, faces + count]),
+        weights=np.ones((2 * count, 1), np.float32),
+        body_vertex=np.concatenate([np.arange(count), np.full(count, -1)]),
+        covered=np.zeros(2 * count, bool),
+    )
+
+
+def test_skin_and_garment_give_back_what_they_took_from_each_other():
+    clothed = meeting_parts()
+    places = map_texels(unwrap(clothed, 0.004), clothed.visible_faces).places
+    x, y, _ = places.on(clothed.vertices, clothed.faces).T
+    true = np.where((x < 0)[:, None], [0.8, 0.6, 0.5], WHITE)
+    true[(x > 0.005) & (x < 0.02) & (y > 0.15)] = [0.2, 0.2, 0.6]  # a trimming on the garment's border
+    for slipped in (0.015, -0.015):  # the scan's border is elsewhere: on the garment, or on skin
+        colors = true.copy()
+        wrong = (x > 0) & (x < slipped) & (y < 0.15) if slipped > 0 else (x < 0) & (x > slipped)
+        colors[wrong] = [0.8, 0.6, 0.5] if slipped > 0 else WHITE
+        seen = SeenColors(colors.astype(np.float32), np.zeros(len(x), np.int64))
+        kept = drop_mixed_borders(places, seen, clothed)
+        assert wrong.sum() > 100 and np.array_equal(kept.seen, ~wrong)
+        assert not kept.colors[wrong].any() and np.array_equal(kept.colors[~wrong], seen.colors[~wrong])
+        filled = fill_unseen(places, kept.colors, kept.seen, clothed.vertices, clothed.faces, clothed.garment_faces)
+        assert np.abs(filled - true).mean() < 0.005
+    alone = SeenColors(seen.colors[x > 0], seen.frames[x > 0])
+    assert drop_mixed_borders(places.some(np.flatnonzero(x > 0)), alone, clothed) is alone
 
 
 def test_a_part_that_nobody_saw_has_the_mean_colour_of_its_kind():
