@@ -238,6 +238,8 @@ def test_skin_and_garment_give_back_what_they_took_from_each_other():
         assert not kept.colors[wrong].any() and np.array_equal(kept.colors[~wrong], seen.colors[~wrong])
         filled = fill_unseen(places, kept.colors, kept.seen, clothed.vertices, clothed.faces, clothed.garment_faces)
         assert np.abs(filled - true).mean() < 0.005
+    alike = SeenColors(np.full((len(x), 3), 0.6, np.float32), np.zeros(len(x), np.int64))  # clothes the colour of skin
+    assert drop_mixed_borders(places, alike, clothed).seen.all()
     alone = SeenColors(seen.colors[x > 0], seen.frames[x > 0])
     assert drop_mixed_borders(places.some(np.flatnonzero(x > 0)), alone, clothed) is alone
 
