@@ -306,7 +306,7 @@ def drop_mixed_borders(places: Places, seen: SeenColors, clothed: ClothedTemplat
             shares = [
                 share_alike(points[mine], seen.colors[mine], points[ids], seen.colors[ids]) for ids in (own, other)
             ]
-            dropped[mine] = (shares[0] < FEW) & (shares[1] > FEW)
+            dropped[mine] = (shares[0] < FEW) & (shares[1] > 0)
     return SeenColors(seen.colors * ~dropped[:, None], np.where(dropped, -1, seen.frames))
 
 
