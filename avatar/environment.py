@@ -31,7 +31,7 @@ APT_PACKAGES |= {"libudev.so": "libudev1", "libidn2.so": "libidn2-0", "libgomp.s
 APT_PACKAGES |= {"libXrender.so": "libxrender1"}
 OPTIONAL = {"open3d": "meshing", "pyvista": "pictures", "pygltflib": "rigged GLB export", "pxr": "USD export"}
 OPTIONAL |= {"tensorboard": "training curves in TensorBoard", "newton": "simulating new outfits"}
-OPTIONAL |= {"anny": "bodies of other shapes", "pyacvd": "clothed templates"}
+OPTIONAL |= {"anny": "bodies of other shapes", "pyacvd": "clothed templates", "xatlas": "textures"}
 
 
 @dataclass(frozen=True)

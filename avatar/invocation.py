@@ -21,6 +21,7 @@ PACKAGE = Path(__file__).resolve().parent
 CORE = ("torch", "numpy", "scipy", "trimesh", "roma", "hydra", "tqdm", "safetensors", "matplotlib", "skimage")
 EXTRAS = {"open3d": "mesh", "pyvista": "pictures", "pygltflib": "export", "pxr": "export", "tensorboard": "log"}
 EXTRAS |= {"newton": "simulate", "warp": "simulate", "anny": "anny", "pyacvd": "mesh", "hydra_plugins": "cluster"}
+EXTRAS |= {"xatlas": "export"}
 # Where a distribution is named otherwise than what is imported
 DISTRIBUTIONS = {"hydra": "hydra-core", "skimage": "scikit-image", "pxr": "usd-core", "warp": "warp-lang"}
 DISTRIBUTIONS |= {"open3d": "open3d-cpu"}

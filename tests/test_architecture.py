@@ -56,6 +56,7 @@ ONLY_IN = {  # package: the subpackages that may name it at all
     "omegaconf": {"config", "arguments"},
     "open3d": {"export"},
     "pyacvd": {"geometry", "runs"},
+    "xatlas": {"export", "runs"},
     "newton": {"simulate"},
     "warp": {"simulate"},
     "triton": {"geometry", "export"},  # in export: loaded before VTK

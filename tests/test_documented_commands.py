@@ -54,6 +54,8 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         "python tools/train.py outfit=dress method=pop",
         "python tools/canonicalize.py dataset=sample outfit=dress",
         "python tools/template.py outfit=dress",
+        "python tools/train.py method=layered outfit=dress name=flowers scan.pattern=flowers train.steps=300 "
+        "method.settings.pose=false",
     ),
     (
         "python tools/experiment.py experiment=closet5",

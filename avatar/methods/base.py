@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from avatar.checks import AvatarError
 from avatar.implicit.extraction import ExtractionConfig
 from avatar.methods.settings import FitConfig, RunConfig
-from avatar.records import Batch, BodyFit, LossTerms, PointCloud, SurfaceSamples, Template
+from avatar.records import Batch, BodyFit, ClothedTemplate, LossTerms, PointCloud, SurfaceSamples, Template
 
 Inputs = tuple[Any, ...]  # dataclasses of tensors; the first has the ``names`` of its frames
 SEED_STRIDE = 1_000_003  # between the seeds of a run's ranks and tasks, so that a step's draw is that of no other run
@@ -168,6 +168,10 @@ class Method(ABC):
         self, avatar: TrainedAvatar, outfit: str, points: int, body: BodyFit | None = None
     ) -> PointCloud | None:
         """The explicit garment template, skinned to a body or in the canonical pose; None for a method without one."""
+        return None
+
+    def mesh_template(self, avatar: TrainedAvatar) -> ClothedTemplate | None:
+        """The clothed template whose faces an avatar's meshes have; None without meshes of constant topology."""
         return None
 
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:

@@ -350,6 +350,9 @@ class Layered(PointMethod):
         normals = normalize(interpolate(vertex_normals(mesh, model.clothed_faces), samples), dim=-1, eps=1e-20)
         return join_clouds([replace(found, points=interpolate(mesh, samples)[None], normals=normals[None])])
 
+    def mesh_template(self, avatar: TrainedAvatar) -> ClothedTemplate | None:
+        return clothed_template(avatar.model.state_dict()) if avatar.settings.head is Head.mesh else None
+
     def fit_code(self, avatar: TrainedAvatar, batch: Batch, options: FitConfig) -> Tensor:
         problem = "run: expected a method whose garment is a code alone, got layered, with a template of its own."
         raise AvatarError(f"{problem} Hint: train the new outfit by itself.")

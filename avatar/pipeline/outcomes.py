@@ -16,7 +16,7 @@ from avatar.invocation import activation_line, command_line, interpreter, option
 from avatar.io.npz import write_whole
 from avatar.progress import WORK, in_words
 
-RESUMED = ("simulate", "canonicalize", "template", "train", "predict", "evaluate", "mesh", "experiment")
+RESUMED = ("simulate", "canonicalize", "template", "train", "predict", "evaluate", "texture", "mesh", "experiment")
 SPLITS = ("train", "test", "interpolation", "validation")
 STOP = "stop"  # a file in the folder of a multirun that was asked to stop
 report = logging.getLogger(__name__)
@@ -63,6 +63,10 @@ def find_ending(verb: str, config: Any, result: Any) -> tuple[list[Path], list[s
                 return [(config.out or config.predictions) / "scores.csv"], []
             made = [scores_file(run, config.split) for run in config.runs]
             return made, [command_line("report", option("run", config.runs[-1]), *split_of(config.split))]
+        case "texture":
+            made = [result / name for name in ("texture.png", "texture.npz", "template.glb", "report.json")]
+            made += [result / "pictures"] if config.pictures and config.scored else []
+            return made, [command_line("mesh", option("run", config.run))]
         case "mesh":
             run = option("run", config.run)
             if config.predictions in SPLITS:

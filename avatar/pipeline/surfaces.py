@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,11 +13,19 @@ from avatar.export.animation import write_animation, write_usd_meshes, write_usd
 from avatar.export.meshing import MeshingReport, PoissonConfig, mesh_folder
 from avatar.export.pictures import frame_camera, render_points
 from avatar.export.rigged import write_rigged_glb
+from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_body_motion
 from avatar.io.points import read_points
+from avatar.io.textures import FILES as TEXTURE_FILES
+from avatar.io.textures import TEXTURED, read_texture, write_textured_mesh
 from avatar.pipeline.scores import meshes_folder, predicted_fps, predictions_folder, run_outfits
+from avatar.progress import tracked
+from avatar.runs.texturing import FOLDER as TEXTURE
 from avatar.runs.training import load_avatar
+
+SOURCE = ("avatar.io.textures",)  # what makes textured meshes
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -51,7 +60,8 @@ class ExportConfig:
 @prepared_process()
 def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
     """Meshes the predictions of every outfit of a run into ``<run>/meshes/<split>/<outfit>``. Frames that could not be
-    meshed are an `AvatarError` after all of them.
+    meshed are an `AvatarError` after all of them. Where predicting has written meshes, and the run has a texture
+    that fits them, they are written again with it (`texture_folder`).
     """
     avatar, reports = load_avatar(config.run), {}
     for name in avatar.config.outfit:
@@ -61,13 +71,40 @@ def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
         frames = spaced_frames(sorted(path.stem for path in folder.glob("*.ply")), config.frames)
         target = meshes_folder(config.run, config.predictions, name)
         if avatar.method.makes_meshes:  # predicting has written its own surfaces
-            reports[target] = MeshingReport(skipped=tuple(frames))
+            reports[target] = texture_folder(config, target, frames)
             continue
         reports[target] = mesh_folder(folder, target, config.formats, frames, config.poisson)
     if failed := {frame: why for report in reports.values() for frame, why in report.failed.items()}:
         frame, why = next(iter(failed.items()))
         raise AvatarError(f"{len(failed)} frames could not be meshed, the others were; {frame}: {why}")
     return reports
+
+
+def texture_folder(config: MeshConfig, folder: Path, frames: list[str]) -> MeshingReport:
+    """Writes a folder's meshes ``<frame>.ply`` as OBJ and GLB with the run's texture, where it has one of their faces.
+
+    PLY stays as it is; frames whose files are still right are not written again.
+    """
+    wanted, source = [ending for ending in config.formats if f".{ending}" in TEXTURED], config.run / TEXTURE
+    if not wanted or not (source / TEXTURE_FILES[0]).is_file():
+        return MeshingReport(skipped=tuple(frames))
+    texture, ledger, written, skipped = read_texture(source), Ledger(folder), [], []
+    pictured = [file_digest(source / name) for name in TEXTURE_FILES]
+    for name in tracked(frames, "textured meshes"):
+        path = folder / f"{name}.ply"
+        if not path.is_file():
+            raise DataError(path, "expected the mesh that predicting writes, there is none.", "Predict again.")
+        key = keyed(SOURCE, mesh=file_digest(path), texture=pictured, formats=wanted)
+        if ledger.find(f"{name} textured", key):
+            skipped.append(name)
+            continue
+        if not texture.fits(found := read_mesh(path)):
+            log.warning("%s: the texture is of other faces, and was left out. Make it again: tools/texture.py.", path)
+            return MeshingReport(tuple(written), tuple(name for name in frames if name not in written))
+        files = [write_textured_mesh(folder / f"{name}.{ending}", found, texture) for ending in wanted]
+        ledger.record(f"{name} textured", key, [file for some in files for file in some])
+        written.append(name)
+    return MeshingReport(tuple(written), tuple(skipped))
 
 
 def spaced_frames(names: list[str], count: int | None) -> list[str]:
