@@ -1,10 +1,11 @@
-"""glTF 2.0 scenes (.glb, .gltf): nodes, primitives and skins as one mesh; nothing outside the file's folder is opened."""
+"""glTF 2.0 scenes (.glb, .gltf): nodes, primitives and skins as one mesh; buffers only from the file's own folder."""
 
 from __future__ import annotations
 
 import base64
 import binascii
 import json
+import shlex
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from avatar.checks import DataError, check_file
-from avatar.io.raw_surface import RawSurface, strip_triangles
+from avatar.io.raw_surface import RawSurface, fan_triangles, strip_triangles
 
 MAX_BYTES = 2 << 30
 MAX_NODES = 100_000
@@ -26,7 +27,7 @@ POINTS, TRIANGLES, STRIP, FAN = 0, 4, 5, 6
 DRACO, QUANTIZED = "KHR_draco_mesh_compression", "KHR_mesh_quantization"
 COMPRESSED = (DRACO, "EXT_meshopt_compression", "KHR_meshopt_compression", QUANTIZED)
 HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_")
-COMMAND = "gltf-transform dequantize {name} plain.glb"  # its reader undoes compression, its command quantisation
+UNDO = {DRACO: "copy"}  # commands of gltf-transform, which all undo compression in reading
 
 
 @dataclass
@@ -46,7 +47,9 @@ class Scene:
         if not (isinstance(entries, list) and type(index) is int and 0 <= index < len(entries)):
             raise DataError(self.path, f"expected {kind}[{index!r:.50}], got none.")
         if not isinstance(entries[index], dict):
-            raise DataError(self.path, f"expected {kind}[{index}] to be an object, got {type(entries[index]).__name__}.")
+            raise DataError(
+                self.path, f"expected {kind}[{index}] to be an object, got {type(entries[index]).__name__}."
+            )
         return entries[index]
 
     def note(self, text: str) -> None:
@@ -69,7 +72,7 @@ class Part:
     vertices: np.ndarray
     normals: np.ndarray | None
     colors: np.ndarray | None
-    faces: np.ndarray | None
+    faces: list[np.ndarray] = field(default_factory=list)  # of each primitive; empty for points
 
 
 def read_gltf(path: Path, data: bytes) -> RawSurface:
@@ -99,11 +102,11 @@ def _read(path: Path, data: bytes) -> RawSurface:
         parts += _mesh_parts(scene, node["mesh"], transform, None if skin is None else _joints(scene, skin, of))
     if skinned:
         scene.note("A skinned mesh is read in the pose its joints are stored in; animations are not applied.")
-    if any(part.faces is not None for part in parts):
-        lone = sum(len(part.vertices) for part in parts if part.faces is None)
+    if any(part.faces for part in parts):
+        lone = sum(len(part.vertices) for part in parts if not part.faces)
         if lone:
             scene.note(f"{lone} points beside its triangles are left out.")
-        parts = [part for part in parts if part.faces is not None]
+        parts = [part for part in parts if part.faces]
     if not parts:
         raise DataError(path, "expected triangles or points in its scene, got none.", "Hint: export the mesh itself.")
     return _join(scene, parts)
@@ -128,7 +131,7 @@ def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | None]:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError(path, f"cannot be read as glTF: its JSON is damaged ({str(error):.200}).") from error
+        raise DataError(path, f"cannot be read as glTF: its JSON is damaged ({error!s:.200}).") from error
     if not isinstance(document, dict):
         raise DataError(path, "expected a glTF document, got other JSON.")
     return document, binary
@@ -143,13 +146,14 @@ def _check_version(path: Path, document: dict[str, Any]) -> None:
         if name in COMPRESSED:
             raise _compressed(path, name)
         if not str(name).startswith(HARMLESS):
-            problem = f"expected plain geometry, got a file that requires the extension {str(name):.100}."
+            problem = f"expected plain geometry, got a file that requires the extension {name!s:.100}."
             raise DataError(path, problem, "Hint: export it without.")
 
 
 def _compressed(path: Path, name: str) -> DataError:
     problem = f"expected plain float32 positions, got geometry with {name}."
-    hint = f"Hint: undo it: {COMMAND.format(name=path.name)} (npm install --global @gltf-transform/cli)."
+    command = f"gltf-transform {UNDO.get(name, 'dequantize')} {shlex.quote(path.name)} plain.glb"
+    hint = f"Hint: undo it with {command} (npm install --global @gltf-transform/cli)."
     return DataError(path, problem, hint)
 
 
@@ -247,7 +251,7 @@ def _mesh_parts(scene: Scene, mesh: int, transform: np.ndarray, joints: np.ndarr
         if faces is not None and joints is None and np.linalg.det(transform[:3, :3]) < 0:
             faces = faces[:, ::-1]  # a mirrored node turns the winding round (glTF 2.0, 3.7.4)
         if faces is not None:
-            part.faces = faces if part.faces is None else np.concatenate([part.faces, faces])
+            part.faces.append(faces)
     return list(parts.values())
 
 
@@ -262,16 +266,17 @@ def _vertices(scene: Scene, attributes: dict[str, int], transform: np.ndarray, j
         colors = np.clip(colors, 0, 1) if np.isfinite(colors).all() else None
     if any(of is not None and len(of) != len(positions) for of in (normals, colors)):
         raise DataError(scene.path, f"expected {len(positions)} normals and colours, got another number.")
-    with np.errstate(all="ignore"):
-        if joints is None:
-            turned = positions @ transform[:3, :3].T + transform[:3, 3]
-            cofactors = np.linalg.det(transform[:3, :3]) * np.linalg.pinv(transform[:3, :3]).T
-            normals = None if normals is None else normals @ cofactors.T * np.sign(np.linalg.det(transform[:3, :3]))
-        else:
-            blended = _blend(scene, attributes, joints, len(positions))
-            turned = np.einsum("vij,vj->vi", blended[:, :3, :3], positions) + blended[:, :3, 3]
-            normals = None if normals is None else np.einsum("vij,vj->vi", blended[:, :3, :3], normals)
-    return Part(turned, normals, colors, None)
+    if joints is None:
+        turned = positions @ transform[:3, :3].T + transform[:3, 3]
+        x, y, z = transform[:3, :3]
+        cofactors = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)])  # the inverse's transpose, scaled
+        sign = np.sign(x @ cofactors[0])
+        normals = None if normals is None else normals @ cofactors.T * sign
+    else:
+        blended = _blend(scene, attributes, joints, len(positions))
+        turned = np.einsum("vij,vj->vi", blended[:, :3, :3], positions) + blended[:, :3, 3]
+        normals = None if normals is None else np.einsum("vij,vj->vi", blended[:, :3, :3], normals)
+    return Part(turned, normals, colors)
 
 
 def _blend(scene: Scene, attributes: dict[str, int], joints: np.ndarray, count: int) -> np.ndarray:
@@ -299,7 +304,9 @@ def _faces(scene: Scene, primitive: dict[str, Any], mode: int, count: int) -> np
     if "indices" in primitive:
         entry = scene.item("accessors", primitive["indices"])
         if entry["componentType"] not in (5121, 5123, 5125):
-            raise DataError(scene.path, f"expected unsigned indices, got component type {entry['componentType']!r:.20}.")
+            raise DataError(
+                scene.path, f"expected unsigned indices, got component type {entry['componentType']!r:.20}."
+            )
         corners = _accessor(scene, primitive["indices"], "SCALAR", normalize=False)[:, 0].astype(np.int64)
     else:
         scene.count(count)
@@ -310,7 +317,7 @@ def _faces(scene: Scene, primitive: dict[str, Any], mode: int, count: int) -> np
     if mode == STRIP:
         return strip_triangles(corners)
     if mode == FAN:
-        return np.stack([np.full(max(len(corners) - 2, 0), corners[:1].sum()), corners[1:-1], corners[2:]], axis=1)
+        return fan_triangles(corners, np.array([len(corners)]))
     if len(corners) % 3:
         raise DataError(scene.path, f"expected three corners a triangle, got {len(corners)} corners.")
     return corners.reshape(-1, 3)
@@ -325,7 +332,9 @@ def _accessor(scene: Scene, index: Any, kind: str, normalize: bool = True) -> np
     entry = scene.item("accessors", index)
     count = entry["count"]
     if entry.get("type") != kind or type(count) is not int or count < 0:
-        raise DataError(scene.path, f"expected an accessor of type {kind}, got {entry.get('type')!r:.20} x {count!r:.20}.")
+        raise DataError(
+            scene.path, f"expected an accessor of type {kind}, got {entry.get('type')!r:.20} x {count!r:.20}."
+        )
     scene.count(count)
     code, width = COMPONENTS[entry["componentType"]], WIDTHS[kind]
     if "bufferView" in entry:
@@ -423,6 +432,6 @@ def _join(scene: Scene, parts: list[Part]) -> RawSurface:
         return None if any(value is None for value in values) else np.concatenate(values)
 
     faces = None
-    if parts[0].faces is not None:
-        faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets)])
+    if parts[0].faces:
+        faces = np.concatenate([piece + offset for part, offset in zip(parts, offsets) for piece in part.faces])
     return RawSurface(scene.path, joined("vertices"), faces, joined("normals"), joined("colors")).noted(*scene.notes)

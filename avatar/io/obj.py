@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from array import array
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ def read_obj(path: Path, data: bytes) -> RawSurface:
     """The mesh or the points of an OBJ file, unchecked: polygons as fans, one vertex for every ``v`` line.
 
     Texture coordinates and normals of corners do not split vertices; normals are kept for points alone (as many ``vn``
-    as ``v``). Materials are not opened. Raises `DataError` naming the file, the line and what is wrong.
+    as ``v``). Materials are not opened. Raises `DataError` naming the file, the line and what is wrong with it.
     """
     if data.startswith(WIDE_BOMS):
         raise DataError(path, "expected OBJ in UTF-8, got UTF-16.", "Hint: save it as UTF-8.")
@@ -28,9 +29,9 @@ def read_obj(path: Path, data: bytes) -> RawSurface:
     vertices, colors, normals = array("d"), array("d"), array("d")
     corners, lengths = array("q"), array("q")
     count, textures, materials, free_forms = 0, 0, False, 0
-    number = 0
+    line = b""
     try:
-        for number, line in enumerate(_lines(data), start=1):
+        for line in _lines(data):
             words = line.split()
             key = words[0] if words else b""
             if key == b"v":
@@ -53,7 +54,9 @@ def read_obj(path: Path, data: bytes) -> RawSurface:
                 free_forms += 1
     except (ValueError, OverflowError) as error:
         hint = "Hint: export it again as a polygon mesh."
-        raise DataError(path, f"line {number} cannot be read as OBJ ({str(error):.200}).", hint) from error
+        raise DataError(
+            path, f"the line {line.strip()!r:.100} cannot be read as OBJ ({error!s:.200}).", hint
+        ) from error
     found, notes = None, []
     if len(colors) == len(vertices) and count:
         found, note = scale_colors(path, np.array(colors).reshape(-1, 3))
@@ -76,7 +79,7 @@ def read_obj(path: Path, data: bytes) -> RawSurface:
     ).noted(*notes)
 
 
-def _lines(data: bytes):
+def _lines(data: bytes) -> Iterator[bytes]:
     """Lines without comments; those that end in a backslash go on in the next."""
     if b"\\" in data:
         data = re.sub(rb"\\[ \t]*\n", b" ", data)

@@ -277,7 +277,7 @@ def _columns(rows: Rows, choices: tuple[tuple[str, ...], ...]) -> np.ndarray | N
 
 def _whole(path: Path, values: np.ndarray) -> np.ndarray:
     """Values as int64; `DataError` where one is none."""
-    if values.dtype.kind == "f":
-        if not (np.isfinite(values) & (values == np.floor(values)) & (np.abs(values) < 2**53)).all():
-            raise DataError(path, "expected vertex indices, got numbers that are not whole.")
+    whole = values.dtype.kind != "f" or ((values == np.floor(values)) & (np.abs(values) < 2**53)).all()
+    if not whole:
+        raise DataError(path, "expected vertex indices, got numbers that are not whole.")
     return values.astype(np.int64)

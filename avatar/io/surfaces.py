@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import io
 import re
-import struct
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, check_faces, check_file, check_finite, check_shape, check_suffix, require
+from avatar.checks import (
+    AvatarError,
+    DataError,
+    check_faces,
+    check_file,
+    check_finite,
+    check_shape,
+    check_suffix,
+    require,
+)
 from avatar.io.gltf import read_gltf
 from avatar.io.npz import naming
 from avatar.io.obj import read_obj
@@ -38,11 +46,11 @@ def read_surface(path: str | Path) -> RawSurface:
     path = Path(path)
     suffix = check_suffix(path, READERS, "a mesh or point file")
     check_file(path, MAX_BYTES)
-    surface = READERS[suffix](path, path.read_bytes())
-    if not len(surface.vertices):
-        raise DataError(path, "expected vertices, got none.", "Hint: export the mesh or the points themselves.")
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows float32 is reported as not finite
+    with np.errstate(all="ignore"):  # what overflows is reported as not finite
+        surface = READERS[suffix](path, path.read_bytes())
         surface = replace(surface, vertices=np.asarray(surface.vertices).astype(np.float32))
+    if not len(surface.vertices):
+        raise DataError(path, "expected triangles or points, got no vertices.", "Hint: export the mesh itself.")
     what = "points" if surface.faces is None else "mesh"
     with naming(path, prefix=f"holds no valid {what}: "):
         if surface.faces is not None:
@@ -94,7 +102,9 @@ def _read_plain(path: Path, data: bytes) -> RawSurface:
     counts = re.findall(rb"\d+", re.sub(rb"#[^\n]*", b"", text))[:3] if suffix == ".off" else []
     if max(map(int, counts), default=0) > len(data):
         largest = max(map(int, counts))
-        raise DataError(path, f"expected a whole file, it promises {largest} elements, more than its {len(data)} bytes.")
+        raise DataError(
+            path, f"expected a whole file, it promises {largest} elements, more than its {len(data)} bytes."
+        )
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings(action="ignore"):  # the check is stricter
             solid = require("trimesh").load_mesh(io.BytesIO(data), file_type=suffix[1:], process=False)
