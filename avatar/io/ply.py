@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
+from array import array
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -114,9 +116,17 @@ def _header(path: Path, data: bytes) -> tuple[str, list[Element], memoryview]:
 
 
 def parse_numbers(text: bytes | memoryview) -> np.ndarray:
-    """Numbers ``(N,)`` float64 of a text separated by white space, as far as it consists of numbers."""
-    with warnings.catch_warnings(action="ignore"):  # that the text goes on: callers count
-        return np.fromstring(bytes(text), np.float64, sep=" ")
+    """Numbers ``(N,)`` float64 of a text separated by white space, up to the first word that is none."""
+    text = bytes(text)
+    try:
+        with warnings.catch_warnings(action="error"):  # which older versions of numpy give instead of the error
+            return np.fromstring(text, np.float64, sep=" ")
+    except (ValueError, DeprecationWarning):
+        numbers = array("d")
+        with suppress(ValueError):
+            for word in text.split():
+                numbers.append(float(word))
+        return np.array(numbers)
 
 
 def _read_ascii(path: Path, body: memoryview, elements: list[Element]) -> dict[str, Rows]:
