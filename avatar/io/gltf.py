@@ -220,6 +220,8 @@ def _joints(scene: Scene, skin: int, world: dict[int, np.ndarray]) -> np.ndarray
     if "inverseBindMatrices" not in entry:
         return joints
     inverse = _accessor(scene, entry["inverseBindMatrices"], "MAT4").reshape(-1, 4, 4)
+    if len(inverse) < len(joints):
+        raise DataError(scene.path, f"expected inverse bind matrices of {len(joints)} joints, got {len(inverse)}.")
     return joints @ np.swapaxes(inverse[: len(joints)], 1, 2)
 
 
@@ -364,8 +366,8 @@ def _accessor(scene: Scene, index: Any, kind: str, normalize: bool = True) -> np
 def _view(scene: Scene, index: Any, offset: Any, count: int, code: str, width: int) -> np.ndarray:
     """Values ``(count, width)`` of a buffer view, within its bounds and its buffer's."""
     view = scene.item("bufferViews", index)
-    if "EXT_meshopt_compression" in view.get("extensions", {}):
-        raise _compressed(scene.path, "EXT_meshopt_compression")
+    for name in set(COMPRESSED) & set(view.get("extensions", {})):
+        raise _compressed(scene.path, name)
     buffer = _buffer(scene, view["buffer"])
     start, length = view.get("byteOffset", 0), view["byteLength"]
     size = np.dtype(code).itemsize * width

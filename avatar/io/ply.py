@@ -62,11 +62,16 @@ def read_ply(path: Path, data: bytes) -> RawSurface:
     if colors is not None:
         colors, note = scale_colors(path, colors)
         notes.append(note)
-    faces, polygons, strips = None, _lists(rows.get("face", {})), _lists(rows.get("tristrips", {}))
+    faced = rows.get("face", {})
+    faces, polygons, strips = None, _lists(faced), _lists(rows.get("tristrips", {}))
     if polygons is not None:
         faces = fan_triangles(_whole(path, polygons.values), polygons.lengths)
         few = int((polygons.lengths < 3).sum())
         notes.append(f"{few} faces of fewer than 3 corners are left out." if few else "")
+    elif any(len(column) if isinstance(column, np.ndarray) else len(column.lengths) for column in faced.values()):
+        raise DataError(
+            path, f"expected faces with vertex_indices, got {', '.join(faced)[:200]}.", "Hint: export it again."
+        )
     elif strips is not None:
         corners = _whole(path, strips.values)
         stops = np.flatnonzero(corners < 0)  # -1 ends a strip
@@ -206,7 +211,7 @@ def _read_binary(path: Path, body: memoryview, elements: list[Element], order: s
 def _binary_rows(path: Path, body: memoryview, place: int, element: Element, order: str) -> tuple[Rows, int]:
     """Rows of one element, and where the next begins: at once where all lists are as long as the first ones."""
     count, lengths, at = element.count, {}, place
-    if not count:
+    if not count or not element.properties:
         return {}, place
     fields: list[tuple] = []
     for name, kind, length in element.properties:

@@ -112,6 +112,15 @@ class TestEncodings:
         path = ply(tmp_path / "a.ply", encoding, ("vertex", xyz(), CORNERS), strips)
         np.testing.assert_array_equal(read_mesh(path).faces, [[0, 1, 3], [3, 1, 2], [3, 1, 0]])
 
+    def test_faces_without_indices_are_no_points(self, tmp_path, encoding):
+        faces = ("face", ["uchar red", "list uchar float texcoord"], [[1, (0, 1)]])
+        path = ply(tmp_path / "a.ply", encoding, ("void", [], []), ("vertex", xyz(), CORNERS), faces)
+        with pytest.raises(DataError, match="expected faces with vertex_indices, got red, texcoord"):
+            read_surface(path)
+        path.write_bytes(path.read_bytes().replace(b"element void 0", b"element void 9"))
+        with pytest.raises(DataError, match="expected faces with vertex_indices"):
+            read_surface(path)
+
     def test_cut_files_are_refused(self, tmp_path, encoding):
         path = ply(
             tmp_path / "a.ply", encoding, ("vertex", xyz(), CORNERS), ("face", FACE, [[(0, 1, 2, 3)], [(0, 1, 2)]])
