@@ -28,6 +28,7 @@ from avatar.io.meshes import read_mesh
 from avatar.io.motions import read_motion
 from avatar.io.npz import write_whole
 from avatar.io.points import read_points
+from avatar.io.surfaces import read_surface
 from avatar.runs.training import load_avatar
 from reliability.findings import Finding, all_of
 from reliability.formats import BVH, smpl_arrays
@@ -37,6 +38,7 @@ from reliability.workers import call_in_process, peak_memory, run_worker
 MOST = 64  # MiB that a refusal may allocate
 HUGE = 1 << 33
 Bomb = Callable[[Path], Callable[[], Any]]
+PCD = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {count}\nHEIGHT 1\nPOINTS {count}\nDATA {kind}\n"
 PLY = "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
 PLY += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
 FACES = "element face {count}\nproperty list uchar int vertex_indices\n"
@@ -121,6 +123,9 @@ def corpus() -> dict[str, Bomb]:
     scene |= {"bufferViews": [{"buffer": 0, "byteLength": 64}]}
     scene |= {"accessors": [accessor], "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}
     scene |= {"nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}], "scene": 0}
+    crowd = scene | {"buffers": [{"byteLength": 12_000}], "bufferViews": [{"buffer": 0, "byteLength": 12_000}]}
+    crowd |= {"accessors": [accessor | {"count": 1000}], "nodes": [{"mesh": 0}] * 10_000}
+    crowd["scenes"] = [{"nodes": list(range(10_000))}]
     aliases = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         f"{new}: &{new} [{', '.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefghi", "bcdefghij")
     )
@@ -144,6 +149,11 @@ def corpus() -> dict[str, Bomb]:
         "off": bomb_file("mesh.off", f"OFF\n{count} {count} 0\n0 0 0\n".encode(), read_mesh),
         "stl": bomb_file("mesh.stl", bytes(80) + struct.pack("<I", count) + bytes(100), read_mesh),
         "glb accessor": bomb_file("mesh.glb", glb(scene, 64), read_mesh),
+        "pcd": bomb_file("scan.pcd", PCD.format(count=count, kind="binary").encode() + bytes(64), read_surface),
+        "pcd, compressed": bomb_file(
+            "scan.pcd", PCD.format(count=1 << 22, kind="binary_compressed").encode() + bytes(64), read_surface
+        ),
+        "glb instances": bomb_file("mesh.glb", glb(crowd, 12_000), read_surface),
         "BVH frames": bomb_file("walk.bvh", BVH.replace("Frames: 3", "Frames: 1000000000").encode(), read_bvh),
         "yaml with exponential aliases": bomb_file("config.yaml", aliases.encode(), read_yaml),
         "yaml, deep": bomb_file("config.yaml", b"a: " + b"[" * 20_000, read_yaml),

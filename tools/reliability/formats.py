@@ -26,9 +26,11 @@ from avatar.io.frames import read_canonical_scan, read_open_frame, read_open_gar
 from avatar.io.meshes import read_mesh, write_mesh
 from avatar.io.motions import read_motion, write_motion
 from avatar.io.points import read_points, write_points
+from avatar.io.surfaces import read_surface
 from avatar.methods.settings import RunConfig
 from avatar.records import CanonicalScan, Mesh, Motion, PointCloud
 from avatar.settings import settings_from_dict, settings_to_dict
+from reliability.foreign_surfaces import MAKERS, make_foreign, validate_surface
 from reliability.mutations import NUMBERS, mutate_array
 from reliability.small_jobs import run_config
 from reliability.validators import (
@@ -367,6 +369,7 @@ FORMATS = {
     "glb": mesh_format(".glb"),
     "stl": mesh_format(".stl"),
     "off": mesh_format(".off"),
+    **{name: Format(make_foreign(name), read_surface, validate_surface) for name in MAKERS},
     "body npz": Format(make_template, packed_body, validate_body, mutate_arrays),
     "frame npz": Format(copied("tee", "train"), read_open_frame, validate_frame, mutate_arrays),
     "garment npz": Format(copied("tee", "garment.npz"), read_open_garment, validate_garment, mutate_arrays),
