@@ -22,7 +22,7 @@ from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.documents import read_json
 from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.io.locks import lock_folder
-from avatar.io.motions import read_body_motion
+from avatar.io.motions import MotionConfig, resample_motion
 from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.settings import RunConfig
@@ -34,14 +34,12 @@ MOTION = "motion.json"  # in the folder of a predicted motion: its frames a seco
 
 
 @dataclass
-class PredictConfig:
+class PredictConfig(MotionConfig):
     """Posed point clouds from a trained run, for the frames of a split or for a motion file."""
 
     run: Path = Path("runs/closet/sample/dress/default")
     split: str = "test"  # or interpolation; validation, the frames that the run held back from training; train
-    motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
-    fps: float = 30.0  # frames a second a motion is resampled to
-    up: str | None = None  # y or z, which axis of the motion's file points up; its format's own if null
+    fps: float | None = None  # frames a second a motion is resampled to, 30 if null; its own where the file has none
     points: int = 50000  # 1,000 to 400,000
     surface: ExtractionConfig = field(default_factory=ExtractionConfig)  # of an implicit avatar
     checkpoint: str = "last"  # or best, on the held-back frames

@@ -13,7 +13,7 @@ from avatar.export.meshing import MeshingReport, PoissonConfig, mesh_folder
 from avatar.export.pictures import frame_camera, render_points
 from avatar.export.rigged import write_rigged_glb
 from avatar.io.meshes import read_mesh
-from avatar.io.motions import read_body_motion
+from avatar.io.motions import MotionConfig
 from avatar.io.points import read_points
 from avatar.pipeline.scores import meshes_folder, predicted_fps, predictions_folder, run_outfits
 from avatar.runs.training import load_avatar
@@ -34,14 +34,12 @@ class MeshConfig:
 
 
 @dataclass
-class ExportConfig:
+class ExportConfig(MotionConfig):
     """Animation files of a predicted sequence: USD caches of points and meshes, a rigged body, a moving picture."""
 
     run: Path = Path("runs/closet/sample/dress/default")
     predictions: str = "walk"  # the motion that was predicted
     fps: float | None = None  # frames a second; those that a motion was predicted at if null, 30 for frames of a split
-    motion: Path | None = None  # the motion's file, for the rigged body's joint tracks
-    up: str | None = None  # y or z, which axis of the motion's file points up; its format's own if null
     data_root: Path | None = None  # where the data are now; where they were at training if null
 
     def __post_init__(self):
