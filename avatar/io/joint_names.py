@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ PREFIX = re.compile(r"^(mixamorig|bip|character|ccbase|mavg|jbip)\d*")
 # first; lower case, without prefix, side, blanks and signs. A joint takes the first that is there.
 TRUNK = {
     "pelvis": ("hips", "pelvis", "hip", "root"),
-    "neck": ("neck", "neck1", "neck01"),
+    "neck": ("neck", "lowerneck"),
     "head": ("head",),
 }
 LIMB = {
@@ -37,9 +37,7 @@ NEEDED = [f"{side}_{joint}" for side in ("left", "right") for joint in ("hip", "
 MAP_HINT = "Give joints=map.yaml, a file with lines such as 'left_elbow: name in the skeleton'."
 
 
-def map_joints(
-    names: Sequence[str], parents: Sequence[int], given: Mapping[str, str] | None = None
-) -> dict[int, int]:
+def map_joints(names: Sequence[str], parents: Sequence[int], given: Mapping[str, str] | None = None) -> dict[int, int]:
     """Our joint index to a skeleton's: those ``given`` by a map (`read_joint_map`), then SMPL's or other common names.
 
     The joints between hips and neck are shared over the spine. Raises `AvatarError` for joints that were not found,
@@ -111,7 +109,8 @@ def _plain_names(names: Sequence[str]) -> list[list[tuple[str, str]]]:
     """Side ("left", "right", "") and part in lower case of each name, the likelier reading first."""
     bare = [re.split(r"[:|]", name)[-1] for name in names]
     if len(bare) > len(NEEDED):  # Character1_LeftArm: what all but the root begin with says nothing
-        shared = len(re.match(r"(.*[^A-Za-z0-9])?", os.path.commonprefix(bare[1:])).group())
+        same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*bare[1:]))
+        shared = len(re.match(r"(.*[^A-Za-z0-9])?", "".join(letters[0] for letters in same)).group())
         bare = [name[shared:] if index and len(name) > shared else name for index, name in enumerate(bare)]
     return [_readings(name) for name in bare]
 
@@ -149,7 +148,7 @@ def _check_chains(names: Sequence[str], parents: Sequence[int], found: Mapping[i
     for side in ("left", "right"):
         for chain in CHAINS:
             mapped = [(f"{side}_{joint}", found.get(INDEX[f"{side}_{joint}"])) for joint in chain]
-            for (upper, above), (lower, below) in zip(mapped, mapped[1:]):
+            for (upper, above), (lower, below) in itertools.pairwise(mapped):
                 at = below
                 while at is not None and at > above:
                     at = parents[at]

@@ -58,7 +58,9 @@ class MotionConfig:
     """A motion file, and what it does not say itself."""
 
     motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
-    up: str | None = None  # y, z, -y or -z, the axis of the file that points up; auto: as people stand; its format's if null
+    up: str | None = (
+        None  # y, z, -y or -z, the axis of the file that points up; auto: as people stand; its format's if null
+    )
     unit: str | None = None  # m, cm, mm or in, of the translations of an .npz; metres if null, refused if feet say no
     start: int = 0  # first frame of the file that is taken
     stop: int | None = None  # frame of the file before which to stop; its end if null
@@ -130,9 +132,7 @@ def read_motion(
             raise AvatarError(f"joints: expected none for {path}, .npz files have SMPL's joints.")
         motion = _read_npz(path, up, rest, fps and fps * (frames.step or 1), unit)
     motion = _take(motion, path, frames)
-    low, high = FRAME_RATES
-    if not low <= motion.fps <= high:
-        raise DataError(path, f"expected {low:g} to {high:g} frames per second, got {motion.fps:g}.")
+    _check_own_rate(path, motion.fps)
     motion = replace(motion, source=path, name=plain_name(motion.name, "motion"))  # frames are files of that name
     return motion if fps is None else resample_motion(motion, fps)
 
@@ -142,6 +142,12 @@ def _check_ending(path: Path) -> None:
     if (ending := path.suffix.lower()) in OTHER_ENDINGS:
         raise DataError(path, f"expected a motion file ending in .npz or .bvh, got {ending!r}.", OTHER_ENDINGS[ending])
     check_suffix(path, (".npz", ".bvh"), "a motion file")
+
+
+def _check_own_rate(path: Path, fps: float) -> None:
+    low, high = FRAME_RATES
+    if not low <= fps <= high:
+        raise DataError(path, f"expected {low:g} to {high:g} frames per second, got {fps:g}.")
 
 
 def _take(motion: Motion, path: Path, frames: slice) -> Motion:
@@ -192,7 +198,7 @@ def resample_motion(motion: Motion, fps: float) -> Motion:
 
 
 def turn_up(motion: Motion, up: str = "z") -> Motion:
-    """A motion turned from another axis to y-up. Bodies stand where they stood, up to a constant shift of the pelvis."""
+    """A motion turned from another axis to y-up. Bodies stand where they stood, up to a shift of the pelvis."""
     if up == "y":
         return motion
     poses = motion.poses.copy()
@@ -208,6 +214,7 @@ def _read_npz(path: Path, up: str | None, rest: np.ndarray, fps: float | None, u
     else:
         arrays = read_smpl_arrays(path, fps, rest[0])
         motion, usual = Motion(arrays.poses, arrays.translations, arrays.fps, path.stem), arrays.usual_up
+    _check_own_rate(path, motion.fps)
     if len(motion.poses) == 0:
         return motion
     motion = replace(motion, translations=np.float32(METRES[unit or "m"]) * motion.translations)
@@ -236,7 +243,9 @@ def _read_bvh(path: Path, up: str | None, rest: np.ndarray, joints: Path | None)
         motion = retarget(bvh, source, path.stem, rest)
         leg = _leg_length(_rest_places(bvh), source)
     unit = min(METRES, key=lambda name: abs(np.log(METRES[name] * leg / LEG)))
-    told = "%s: %d joints of %d mapped by name, size fitted to the body's legs: one of %.3g here, which is likely in %s."
+    told = (
+        "%s: %d joints of %d mapped by name, size fitted to the body's legs: one of %.3g here, which is likely in %s."
+    )
     log.info(told, path, len(source), len(bvh.names), leg, unit)
     return motion
 

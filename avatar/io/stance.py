@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
+from avatar.body.model import SMPL_PARENTS
 from avatar.checks import DataError, unknown_name
+from avatar.io.joint_names import INDEX
 
 log = logging.getLogger(__name__)
 
-INDEX = {name: index for index, name in enumerate(SMPL_JOINTS)}
 Y_FROM = {  # rotations that turn a world, upright along an axis, to y up; about x, as SMPL's people face along z
     "y": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
@@ -31,7 +31,7 @@ FRAMES = 2000  # that are looked at
 FASTEST = 15.0  # m/s of the pelvis, for one frame in twenty
 RISE = 3.0  # m between the pelvis's highest and lowest place: more is mentioned
 PLANTED = 0.5  # share of the feet's movement about the pelvis that its travel explains, where one can tell a unit
-BACKWARDS, TWISTED = 15.0, 70.0  # degrees, medians over the frames
+BACKWARDS, SIDEWAYS, TWISTED = 15.0, 40.0, 60.0  # degrees, medians over the frames
 
 
 def check_up(up: str | None) -> None:
@@ -97,17 +97,18 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
     While a foot stands the pelvis moves against it: what it moves by, in metres, over what the file says is the unit.
     ``places (T, 22, 3)`` are joints about the pelvis. Also refused: more than 15 m/s; a rise of 3 m is warned about.
     """
-    steps = np.diff(travel, axis=0)
-    if len(steps) < 3 or not steps.any():
+    speed = float(np.percentile(np.linalg.norm(np.diff(travel, axis=0), axis=1), 95)) * fps if len(travel) > 3 else 0.0
+    stride = max(1, round(fps / 15))  # frames; over fewer, noise is more than movement
+    places, steps = places[::stride], np.diff(travel[::stride], axis=0)
+    if len(travel) < 4 or not speed:
         return
     hint = "Give unit=cm, mm, in or, if it is right, m."
     feet = places[:, [INDEX[f"{side}_{joint}"] for side in ("left", "right") for joint in ("ankle", "foot")]]
     lowest = (feet[1:, :, 1] + feet[:-1, :, 1]).argmin(axis=1)
     moved = np.diff(feet, axis=0)[np.arange(len(steps)), lowest]
-    scale = -float((moved * steps).sum() / (steps * steps).sum())
+    scale = -float((moved * steps).sum() / max(float((steps * steps).sum()), 1e-12))
     explained = 1 - float(np.square(moved + scale * steps).sum() / max(np.square(moved).sum(), 1e-12))
-    speed = float(np.percentile(np.linalg.norm(steps, axis=1), 95)) * fps
-    if unit is None and len(steps) >= 10 and explained > PLANTED and (scale < 0.1 or scale > 10):
+    if unit is None and len(steps) >= 10 and explained > PLANTED and 0 < scale < 0.1:
         near = min(METRES, key=lambda name: abs(np.log(METRES[name] / scale)))
         problem = f"expected translations in metres, feet stand still if their unit is {scale:.3g} m, which is {near}."
         raise DataError(path, problem, f"Give unit={near} or, if they are in metres, unit=m.")
@@ -118,7 +119,9 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
 
 
 def check_joint_order(path: Path, poses: np.ndarray) -> None:
-    """Warns of knees and elbows that bend backwards and of trunks that twist, as joints in another order do."""
+    """Warns of knees and elbows that bend backwards, knees that bend sideways and trunks that twist: joints in another
+    order than SMPL's do so.
+    """
     bends = {
         **{f"{side}_knee": poses[:, INDEX[f"{side}_knee"], 0] for side in ("left", "right")},
         **{f"{s}_elbow": poses[:, INDEX[f"{s}_elbow"], 1] * (-1 if s == "left" else 1) for s in ("left", "right")},
@@ -126,8 +129,11 @@ def check_joint_order(path: Path, poses: np.ndarray) -> None:
     medians = {joint: float(np.degrees(np.median(angles))) for joint, angles in bends.items()}
     trunk = {j: np.linalg.norm(poses[:, INDEX[j]], axis=1) for j in ("spine1", "spine2", "spine3", "neck")}
     turned = {joint: float(np.degrees(np.median(angles))) for joint, angles in trunk.items()}
+    across = {f"{side}_knee": poses[:, INDEX[f"{side}_knee"], 1:] for side in ("left", "right")}
+    sideways = {j: float(np.degrees(np.median(np.linalg.norm(turns, axis=1)))) for j, turns in across.items()}
     faults = [f"{joint} bends backwards by {-angle:.0f}" for joint, angle in medians.items() if angle < -BACKWARDS]
     faults += [f"{joint} is turned by {angle:.0f}" for joint, angle in turned.items() if angle > TWISTED]
+    faults += [f"{joint} bends sideways by {angle:.0f}" for joint, angle in sideways.items() if angle > SIDEWAYS]
     if faults:
         log.warning(
             "%s: %s degrees (medians): expected joints in SMPL's order, left before right; look at the result.",

@@ -30,7 +30,8 @@ from avatar.nn.decoders import Normals
 from avatar.runs.prediction import predict_frames
 from avatar.runs.training import load_avatar
 
-MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
+MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second, and how many there are
+DEFAULT_RATE = 30.0  # frames a second of predicted motions
 
 
 @dataclass
@@ -94,7 +95,9 @@ def predict(config: PredictConfig) -> list[Path]:
     """Predicts every outfit of a run; gives the folders of point clouds. A motion needs bodies that can be posed."""
     avatar, folders = load_avatar(config.run, config.checkpoint, config.device), []
     for outfit in run_outfits(avatar, config.data_root):
-        motion = config.motion and read_body_motion(config.motion, outfit.posable_body(), config.fps, config.up)
+        motion = config.motion and config.read_motion(outfit.posable_body(), config.fps)
+        if motion and config.fps is None and config.step == 1:
+            motion = resample_motion(motion, DEFAULT_RATE)
         name = motion.name if motion else config.split
         folders.append(predictions_folder(config.run, name, outfit.name))
         where = (folders[-1], meshes_folder(config.run, name, outfit.name), config.points, config.surface)
@@ -102,14 +105,20 @@ def predict(config: PredictConfig) -> list[Path]:
         if motion:
             for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
                 path.unlink()  # the end of an earlier prediction with more frames a second
-            write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
+            write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps, "frames": len(motion.poses)}).encode())
     return folders
 
 
 def predicted_fps(folder: Path) -> float:
     """The frames a second that a motion was predicted at; 30 for the frames of a split."""
     path = folder / MOTION
-    return float(read_json(path)["fps"]) if path.is_file() else 30.0
+    return float(read_json(path)["fps"]) if path.is_file() else DEFAULT_RATE
+
+
+def predicted_count(folder: Path) -> int | None:
+    """The frames that a motion was predicted in; None where that was not noted."""
+    path = folder / MOTION
+    return read_json(path).get("frames") if path.is_file() else None
 
 
 @prepared_process()

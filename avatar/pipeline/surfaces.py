@@ -15,7 +15,8 @@ from avatar.export.rigged import write_rigged_glb
 from avatar.io.meshes import read_mesh
 from avatar.io.motions import MotionConfig
 from avatar.io.points import read_points
-from avatar.pipeline.scores import meshes_folder, predicted_fps, predictions_folder, run_outfits
+from avatar.pipeline.scores import meshes_folder, predicted_count, predicted_fps, predictions_folder, run_outfits
+from avatar.records import Motion
 from avatar.runs.training import load_avatar
 
 
@@ -43,6 +44,7 @@ class ExportConfig(MotionConfig):
     data_root: Path | None = None  # where the data are now; where they were at training if null
 
     def __post_init__(self):
+        super().__post_init__()
         check_name("predictions", self.predictions)
 
 
@@ -86,7 +88,8 @@ def export(config: ExportConfig) -> list[Path]:
         folder = predictions_folder(config.run, config.predictions, outfit.name)
         fps, motion = config.fps or predicted_fps(folder), None
         if config.motion and outfit.body is not None:
-            motion = read_body_motion(config.motion, outfit.body, fps, config.up)
+            motion = config.read_motion(outfit.body, fps)
+            check_same_frames(config, folder, motion)
         jobs.append((outfit, folder, fps, motion))
     for outfit, folder, fps, motion in jobs:  # all motions were read by now
         meshes = meshes_folder(config.run, config.predictions, outfit.name)
@@ -101,6 +104,14 @@ def export(config: ExportConfig) -> list[Path]:
             write_rigged_glb(target / "body.glb", outfit.body, motion)
             written.append(target / "body.glb")
     return written
+
+
+def check_same_frames(config: ExportConfig, folder: Path, motion: Motion) -> None:
+    """Refuses a motion of another number of frames than was predicted, at the same rate."""
+    predicted, read = predicted_count(folder), len(motion.poses)
+    if predicted is not None and predicted != read and motion.fps == predicted_fps(folder):
+        problem = f"expected the {predicted} frames that were predicted, got {read}."
+        raise DataError(config.motion, problem, "Give start=, stop= and step= as to predict.")
 
 
 def numbered_frames(names: Iterable[str]) -> dict[str, dict[int, str]]:
