@@ -58,9 +58,7 @@ class MotionConfig:
     """A motion file, and what it does not say itself."""
 
     motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
-    up: str | None = (
-        None  # y, z, -y or -z, the axis of the file that points up; auto: as people stand; its format's if null
-    )
+    up: str | None = None  # y, z, -y, -z: the file's axis that points up; auto: as people stand; its format's if null
     unit: str | None = None  # m, cm, mm or in, of the translations of an .npz; metres if null, refused if feet say no
     start: int = 0  # first frame of the file that is taken
     stop: int | None = None  # frame of the file before which to stop; its end if null
