@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from avatar.body.model import SMPL_JOINTS
-from avatar.checks import AvatarError, DataError, sentences, unknown_name
+from avatar.checks import AvatarError, DataError, unknown_name
 from avatar.io.documents import read_yaml
 
 INDEX = {name: index for index, name in enumerate(SMPL_JOINTS)}
@@ -54,8 +54,7 @@ def map_joints(names: Sequence[str], parents: Sequence[int], given: Mapping[str,
     missing = [joint for joint in NEEDED if INDEX[joint] not in found]
     if missing:
         problem = f"found none for {', '.join(missing)} among {', '.join(names[:40])}."
-        problem = f"joints: expected the names of a SMPL, Mixamo, CMU or LAFAN skeleton, {problem}"
-        raise AvatarError(sentences(problem, f"Hint: {MAP_HINT}"))
+        raise AvatarError(f"joints: expected the names of a SMPL, Mixamo, CMU or LAFAN skeleton, {problem}")
     _check_chains(names, parents, found)
     return dict(sorted((found if exact else found | _spine(parents, found)).items()))
 
@@ -154,4 +153,4 @@ def _check_chains(names: Sequence[str], parents: Sequence[int], found: Mapping[i
                     at = parents[at]
                 if at is not None and at != above:
                     problem = f"{lower} is {names[below]!r}, which is not below {names[above]!r}, taken for {upper}."
-                    raise AvatarError(f"joints: expected {lower} below {upper}, got others: {problem} Hint: {MAP_HINT}")
+                    raise AvatarError(f"joints: expected {lower} below {upper}, got others: {problem}")

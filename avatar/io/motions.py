@@ -15,13 +15,14 @@ from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.checks import AvatarError, DataError, check_suffix, plain_name
 from avatar.io.amass import read_smpl_arrays
 from avatar.io.bvh import BvhMotion, read_bvh
-from avatar.io.joint_names import INDEX, map_joints, read_joint_map
+from avatar.io.joint_names import INDEX, MAP_HINT, map_joints, read_joint_map
 from avatar.io.npz import naming, read_arrays, write_described
 from avatar.io.stance import (
     FRAMES,
     METRES,
     Y_FROM,
     check_joint_order,
+    check_sides,
     check_travel,
     check_unit,
     check_up,
@@ -232,12 +233,14 @@ def _both(joint: str) -> list[int]:
 def _read_bvh(path: Path, up: str | None, rest: np.ndarray, joints: Path | None) -> Motion:
     """A BVH file on our joints, turned y-up."""
     bvh, given = read_bvh(path), read_joint_map(joints)
-    with naming(path):
+    with naming(path, MAP_HINT):
         source = map_joints(bvh.names, bvh.parents, given)
+    with naming(path):
         low, high = (bvh.positions[:, [source[j] for j in _both(name)]].mean(axis=1) for name in ("ankle", "shoulder"))
         turn = Y_FROM[settle_up(path, low, high, up, "y")]
         moved = {name: getattr(bvh, name) @ turn.T for name in ("offsets", "positions")}
         bvh = replace(bvh, rotations=turn @ bvh.rotations @ turn.T, **moved)
+        check_sides(path, bvh.positions, source)
         motion = retarget(bvh, source, path.stem, rest)
         leg = _leg_length(_rest_places(bvh), source)
     unit = min(METRES, key=lambda name: abs(np.log(METRES[name] * leg / LEG)))

@@ -79,7 +79,9 @@ def settle_up(path: Path, low: np.ndarray, high: np.ndarray, up: str | None, usu
         log.warning("%s: people stand along %s %s, which is taken for up.", path, best, told)
         return best
     elif usual is None or up == AUTO:
-        raise DataError(path, f"expected people who stand along an axis, the nearest is {best} {told}.", "Give up=.")
+        raise DataError(
+            path, f"expected people who stand along an axis, the nearest is {best} {told}.", "Give up=y, z, -y or -z."
+        )
     elif shares[best] > ELSEWHERE:
         problem = f"expected people upright along {usual}, they are upright along {best} {told}."
         raise DataError(path, problem, f"Give up={best}, or up={usual} if people really lie down.")
@@ -106,8 +108,12 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
     feet = places[:, [INDEX[f"{side}_{joint}"] for side in ("left", "right") for joint in ("ankle", "foot")]]
     lowest = (feet[1:, :, 1] + feet[:-1, :, 1]).argmin(axis=1)
     moved = np.diff(feet, axis=0)[np.arange(len(steps)), lowest]
-    scale = -float((moved * steps).sum() / max(float((steps * steps).sum()), 1e-12))
-    explained = 1 - float(np.square(moved + scale * steps).sum() / max(np.square(moved).sum(), 1e-12))
+    scale, explained = _planted(moved, steps)
+    others = {axis: _planted(moved, steps @ turn.T)[1] for axis, turn in Y_FROM.items() if axis != "y"}
+    best = max(others, key=others.get)
+    if len(steps) >= 10 and others[best] > PLANTED and explained < PLANTED / 2:
+        told = "translations fit the feet (%.2f of 1, as they are %.2f) if they are turned up without the poses"
+        log.warning(f"%s: {told}: correct the file if people fly.", path, others[best], explained)
     if unit is None and len(steps) >= 10 and explained > PLANTED and 0 < scale < 0.1:
         near = min(METRES, key=lambda name: abs(np.log(METRES[name] / scale)))
         problem = f"expected translations in metres, feet stand still if their unit is {scale:.3g} m, which is {near}."
@@ -116,6 +122,30 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
         raise DataError(path, f"expected a pelvis slower than {FASTEST:g} m/s, it moves at {speed:.3g} m/s.", hint)
     if (rise := float(np.ptp(travel[:, 1]))) > RISE:
         log.warning("%s: the pelvis rises and falls by %.1f m; give up= or unit= if people fly.", path, rise)
+
+
+def _planted(moved: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
+    """The factor of the pelvis's ``steps (T, 3)`` that undoes how the standing foot ``moved`` about it, and the share
+    of that movement's square which it undoes.
+    """
+    scale = -float((moved * steps).sum() / max(float((steps * steps).sum()), 1e-12))
+    return scale, 1 - float(np.square(moved + scale * steps).sum() / max(float(np.square(moved).sum()), 1e-12))
+
+
+def check_sides(path: Path, places: np.ndarray, source: dict[int, int]) -> None:
+    """Warns of toes behind their ankles, as where left and right are swapped; ``places (T, J, 3)`` are y-up."""
+    left, right = (places[:, source[INDEX[f"{side}_hip"]]] for side in ("left", "right"))
+    ahead = np.cross(left - right, [0.0, 1.0, 0.0])
+    for side in ("left", "right"):
+        ankle, foot = (source.get(INDEX[f"{side}_{joint}"]) for joint in ("ankle", "foot"))
+        if foot is None:
+            continue
+        toes = places[:, foot] - places[:, ankle]
+        lengths = np.linalg.norm(toes, axis=1) * np.linalg.norm(ahead, axis=1)
+        cosine = float(np.median((toes * ahead).sum(axis=1) / np.maximum(lengths, 1e-12)))
+        if cosine < -UPRIGHT:
+            told = "toes point backwards (%s: %.2f of 1): left and right may be swapped, joints=map.yaml names them."
+            log.warning(f"%s: {told}", path, side, -cosine)
 
 
 def check_joint_order(path: Path, poses: np.ndarray) -> None:

@@ -141,8 +141,8 @@ def load_motion(
         legs = [pose_path(a, b, round(fps)) for a, b in itertools.pairwise(stops)]
         motion = Motion(np.concatenate([stops[0][None], *legs]), np.zeros(0), fps, source)
     elif Path(source).suffix in (".npz", ".bvh"):
-        names = joints if Path(source).suffix == ".bvh" else None
-        motion = read_motion(Path(source), fps, up, joints=names)
+        given = {"joints": joints} if Path(source).suffix == ".bvh" else {"unit": "m"}  # any: translations are not used
+        motion = read_motion(Path(source), fps, up, **given)
     else:
         known = ", ".join((*SEQUENCES, *EVERYDAY))
         raise AvatarError(f"motion: expected {known} or a .npz or .bvh file, got {source!r}.")

@@ -203,6 +203,13 @@ def test_speeds_and_heights_of_no_person_are_noticed(tmp_path, walk, caplog):
     assert "rises and falls by 6.0 m; give up= or unit=" in caplog.text
 
 
+def test_translations_of_another_axis_than_poses_are_noticed(tmp_path, walk, caplog):
+    arrays = smpl_arrays(walk)
+    np.savez(tmp_path / "a.npz", poses=wide(arrays, 156), trans=walk.translations, mocap_framerate=30)
+    read_motion(tmp_path / "a.npz")
+    assert "if they are turned up without the poses: correct the file" in caplog.text
+
+
 def test_joints_in_another_order_are_noticed(tmp_path, caplog):
     motion = authored_motion("dance", fps=30, seconds=2)
     swapped, openpose = motion.poses.copy(), np.zeros_like(motion.poses)

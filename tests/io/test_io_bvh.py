@@ -241,7 +241,7 @@ def test_other_up_axes_are_noticed_and_read_as_named_or_found(tmp_path, walk, ba
 def test_a_map_names_the_joints_of_any_rig(tmp_path, walk):
     strange = {joint: f"Bone {number} ü" for number, joint in enumerate(SMPL_JOINTS)}
     path = write_bvh(tmp_path / "a.bvh", walk, names=strange, prefix="")
-    with pytest.raises(DataError, match=r"a\.bvh: joints: .*found none for left_hip, left_knee.*Hint: Give joints="):
+    with pytest.raises(DataError, match=r"a\.bvh: joints: .*found none for left_hip, left_knee.*Give joints=map"):
         read_motion(path)
     names = tmp_path / "map.yaml"
     names.write_text("\n".join(f"{ours}: {theirs}" for ours, theirs in strange.items()), encoding="utf-8")
@@ -287,3 +287,30 @@ def test_every_joint_may_have_an_order_of_its_own(tmp_path, walk):
     path.write_text("\n".join([f"{text}MOTION", *lines[1:3], *(" ".join(map(str, row)) for row in rows)]))
     assert_same(read_motion(path), walk)
     assert len(read_bvh(path).names) == 22
+
+
+def test_swapped_sides_are_noticed_by_the_toes(tmp_path, walk, caplog):
+    swap = {"left": "Right", "right": "Left"}
+    names = {j: MIXAMO[j].replace("Left", "").replace("Right", "") for j in SMPL_JOINTS}
+    names = {j: swap.get(j.split("_")[0], "") + name for j, name in names.items()}
+    read_motion(write_bvh(tmp_path / "a.bvh", walk, names=names))
+    assert re.search(r"toes point backwards \(left: 0\.\d\d of 1\): left and right may be swapped", caplog.text)
+    caplog.clear()
+    read_motion(write_bvh(tmp_path / "a.bvh", walk))
+    assert not caplog.records
+
+
+def test_damaged_files_are_one_error_or_read(tmp_path, walk):
+    """Bytes changed, cut out and doubled at random: nothing but a `DataError` ever comes of it."""
+    text = write_bvh(tmp_path / "a.bvh", Motion(walk.poses[:2], walk.translations[:2], 30.0, "a")).read_text()
+    rng, path, refused = np.random.default_rng(1), tmp_path / "b.bvh", 0
+    for _ in range(300):
+        start, length = rng.integers(len(text)), int(rng.integers(1, 60))
+        piece = text[start : start + length]
+        other = rng.choice(["", piece * 2, "}", "{", "JOINT x", "CHANNELS 3 ", "-", "1e999", "#", "\n", "Frames: 7"])
+        path.write_text(text[:start] + str(other) + text[start + length :])
+        try:
+            read_motion(path)
+        except DataError:
+            refused += 1
+    assert refused > 150
