@@ -30,6 +30,7 @@ UPRIGHT, ELSEWHERE = 0.5, 0.8  # mean cosine between a person, from ankles to sh
 FRAMES = 2000  # that are looked at
 FASTEST = 15.0  # m/s of the pelvis, for one frame in twenty
 RISE = 3.0  # m between the pelvis's highest and lowest place: more is mentioned
+STILL = 0.001  # m
 PLANTED = 0.5  # share of the feet's movement about the pelvis that its travel explains, where one can tell a unit
 BACKWARDS, SIDEWAYS, TWISTED = 15.0, 40.0, 60.0  # degrees, medians over the frames
 
@@ -126,10 +127,12 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
 
 def _planted(moved: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
     """The factor of the pelvis's ``steps (T, 3)`` that undoes how the standing foot ``moved`` about it, and the share
-    of that movement's square which it undoes.
+    of that movement's square which it undoes; nothing is told by feet that move less than a millimetre.
     """
+    if np.square(moved).sum() < len(moved) * STILL**2:
+        return 1.0, 0.0
     scale = -float((moved * steps).sum() / max(float((steps * steps).sum()), 1e-12))
-    return scale, 1 - float(np.square(moved + scale * steps).sum() / max(float(np.square(moved).sum()), 1e-12))
+    return scale, 1 - float(np.square(moved + scale * steps).sum() / np.square(moved).sum())
 
 
 def check_sides(path: Path, places: np.ndarray, source: dict[int, int]) -> None:

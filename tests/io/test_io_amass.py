@@ -192,6 +192,13 @@ def test_right_motions_are_read_without_a_word(tmp_path, name, caplog):
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
 
 
+def test_a_statue_that_is_moved_tells_no_unit(tmp_path, walk):
+    still = Motion(np.repeat(walk.poses[:1], 45, axis=0), np.linspace([0, 0, 0], [0, 0, 2], 45), 30.0, "a")
+    arrays = smpl_arrays(still)
+    np.savez(tmp_path / "a.npz", poses=wide(arrays, 156), trans=arrays["trans"], mocap_framerate=30)
+    assert_same(read_motion(tmp_path / "a.npz"), still)
+
+
 def test_speeds_and_heights_of_no_person_are_noticed(tmp_path, walk, caplog):
     arrays = smpl_arrays(Motion(walk.poses, np.linspace([0, 0, 0], [0, 0, 60], len(walk.poses)), 30.0, "a"))
     np.savez(tmp_path / "a.npz", poses=wide(arrays, 156), trans=arrays["trans"], mocap_framerate=30)
