@@ -22,7 +22,7 @@ FARTHEST = 1e9  # of any number in a file: millimetres to the moon would do
 MOVES = {f"{axis}position" for axis in "xyz"}
 HEADER = re.compile(r"\s*MOTION\s+Frames\s*:?\s*(\S+)\s+Frame\s+Time\s*:?\s*(\S+)", re.IGNORECASE)
 COMMENT = re.compile(r"^[ \t]*(#|//|;).*$", re.MULTILINE)
-STRETCH = 0.02  # of the skeleton's size: bones that lengthen more than this are mentioned
+STRETCH = 0.02  # of a mean bone: those that lengthen by more are mentioned
 CHANNELS = MOVES | {f"{axis}rotation" for axis in "xyz"}
 
 
@@ -131,7 +131,8 @@ def _read_frames(path: Path, text: str, channels: int) -> tuple[np.ndarray, floa
         start = " ".join(text.split()[:6])
         raise ValueError(f"after the skeleton MOTION, Frames: and Frame Time: were expected, it goes on {start!r}")
     frames, seconds = int(header[1]), float(header[2])
-    values = np.array(re.sub(r"#.*", "", text[header.end() :]).split(), dtype=np.float64)
+    lines = [line.split() for line in re.sub(r"#.*", "", text[header.end() :]).splitlines()]
+    values = np.array([word for line in lines for word in line], dtype=np.float64)
     rows, rest = divmod(values.size, max(channels, 1))
     if frames < 1 or channels < 3 or rest or rows < frames:
         raise ValueError(
@@ -139,6 +140,8 @@ def _read_frames(path: Path, text: str, channels: int) -> tuple[np.ndarray, floa
             f"{values.size / max(channels, 1):.6g} rows of {channels}"
         )
     if rows > frames:
+        if (widths := {len(line) for line in lines if line} - {channels}) and len(lines) > 1:
+            raise ValueError(f"rows of {channels} numbers were expected, there are some of {min(widths)}")
         log.warning("%s: read the %d frames that its header declares of the %d rows there.", path, frames, rows)
         values = values[: frames * channels]
     if not np.abs(values).max() <= FARTHEST or not 1e-4 <= seconds <= 10:

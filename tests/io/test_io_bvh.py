@@ -179,6 +179,15 @@ def test_more_rows_are_left_out_with_a_warning_and_fewer_refused(tmp_path, walk,
         read_motion(path)
 
 
+def test_rows_of_other_lengths_are_not_taken_for_more_rows(tmp_path, walk):
+    path = write_bvh(tmp_path / "a.bvh", walk)
+    head, _, motion = path.read_text().partition("MOTION")
+    lines = motion.splitlines()
+    path.write_text("\n".join([head + "MOTION", *lines[1:3], *(f"{line} {line}" for line in lines[3:])]))
+    with pytest.raises(DataError, match="rows of 69 numbers were expected, there are some of 138"):
+        read_motion(path)
+
+
 def six_channels(text, place):
     """Positions at every joint, ``place(offset, frame, joint)`` of them; the root has its own already."""
     head, _, motion = text.partition("MOTION")
