@@ -58,7 +58,7 @@ OTHER_ENDINGS = {
 class MotionConfig:
     """A motion file, and what it does not say itself."""
 
-    motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
+    motion: Path | None = None  # AMASS .npz, BVH or one of our own: predicted instead of a split, exported as tracks
     up: str | None = None  # y, z, -y, -z: the file's axis that points up; auto: as people stand; its format's if null
     unit: str | None = None  # m, cm, mm or in, of the translations of an .npz; metres if null, refused if feet say no
     start: int = 0  # first frame of the file that is taken
