@@ -24,7 +24,7 @@ from avatar.io.stance import (
     check_joint_order,
     check_sides,
     check_travel,
-    check_unit,
+    check_units,
     check_up,
     joint_places,
     settle_up,
@@ -60,7 +60,7 @@ class MotionConfig:
 
     motion: Path | None = None  # AMASS .npz, BVH or one of our own: predicted instead of a split, exported as tracks
     up: str | None = None  # y, z, -y, -z: the file's axis that points up; auto: as people stand; its format's if null
-    unit: str | None = None  # m, cm, mm or in, of the translations of an .npz; metres if null, refused if feet say no
+    units: str | None = None  # m, cm, mm or in, of the translations of an .npz; metres if null, refused if feet say no
     start: int = 0  # first frame of the file that is taken
     stop: int | None = None  # frame of the file before which to stop; its end if null
     step: int = 1  # every so many frames of the file; not resampled to 30 a second then
@@ -68,7 +68,7 @@ class MotionConfig:
 
     def __post_init__(self):
         check_up(self.up)
-        check_unit(self.unit)
+        check_units(self.units)
         if self.start < 0 or self.step < 1 or (self.stop is not None and self.stop <= self.start):
             got = f"start={self.start} stop={self.stop} step={self.step}"
             raise AvatarError(f"start, stop, step: expected 0 <= start < stop and step of at least 1, got {got}.")
@@ -78,7 +78,7 @@ class MotionConfig:
         if self.motion is None:
             raise AvatarError("motion: expected a file, got none.")
         frames = slice(self.start, self.stop, self.step)
-        return read_body_motion(self.motion, body, fps, self.up, self.unit, frames, self.joints)
+        return read_body_motion(self.motion, body, fps, self.up, self.units, frames, self.joints)
 
 
 def read_body_motion(
@@ -86,7 +86,7 @@ def read_body_motion(
     body: BodyModel,
     fps: float | None = None,
     up: str | None = None,
-    unit: str | None = None,
+    units: str | None = None,
     frames: slice = ALL,
     joints: Path | None = None,
 ) -> Motion:
@@ -95,7 +95,7 @@ def read_body_motion(
     BVH skeletons are fitted to the body's proportions; translations of npz files (SMPL's ``trans``) are taken as they
     are. Raises `AvatarError` for a body whose joints have unknown names.
     """
-    return move_body(read_motion(path, fps, up, rest_joints(body), unit, frames, joints), body)
+    return move_body(read_motion(path, fps, up, rest_joints(body), units, frames, joints), body)
 
 
 def read_motion(
@@ -103,7 +103,7 @@ def read_motion(
     fps: float | None = None,
     up: str | None = None,
     rest: np.ndarray | None = None,
-    unit: str | None = None,
+    units: str | None = None,
     frames: slice = ALL,
     joints: Path | None = None,
 ) -> Motion:
@@ -113,23 +113,23 @@ def read_motion(
     The file's ``frames`` are taken, then resampled to ``fps``, at which they are if the file has no rate. BVH skeletons
     are mapped by joint names, or those of a file ``joints`` (`read_joint_map`), and fitted in size to T-pose joints
     ``rest (22, 3)`` (the open body's if None). Raises `DataError` for an invalid file, people who lie down or
-    translations that are not in metres or the given ``unit``; `AvatarError` for a bad ``up``, ``unit`` or ``fps``.
+    translations that are not in metres or the given ``units``; `AvatarError` for a bad ``up``, ``units`` or ``fps``.
     """
     path = Path(path)
     check_up(up)
-    check_unit(unit)
+    check_units(units)
     if fps is not None:
         check_rate(fps)
     _check_ending(path)
     rest = open_body(MEAN_SHAPE).template.joints.double().numpy() if rest is None else rest
     if path.suffix.lower() == ".bvh":
-        if unit is not None:
-            raise AvatarError(f"unit: expected none for {path}, BVH files are scaled by the skeleton's legs.")
+        if units is not None:
+            raise AvatarError(f"units: expected none for {path}, BVH files are scaled by the skeleton's legs.")
         motion = _read_bvh(path, up, rest, joints)
     else:
         if joints is not None:
             raise AvatarError(f"joints: expected none for {path}, .npz files have SMPL's joints.")
-        motion = _read_npz(path, up, rest, fps and fps * (frames.step or 1), unit)
+        motion = _read_npz(path, up, rest, fps and fps * (frames.step or 1), units)
     motion = _take(motion, path, frames)
     _check_own_rate(path, motion.fps)
     motion = replace(motion, source=path, name=plain_name(motion.name, "motion"))  # frames are files of that name
@@ -205,7 +205,7 @@ def turn_up(motion: Motion, up: str = "z") -> Motion:
     return replace(motion, poses=poses, translations=(motion.translations @ Y_FROM[up].T).astype(np.float32))
 
 
-def _read_npz(path: Path, up: str | None, rest: np.ndarray, fps: float | None, unit: str | None) -> Motion:
+def _read_npz(path: Path, up: str | None, rest: np.ndarray, fps: float | None, units: str | None) -> Motion:
     """Our own motion, y-up by default, or one of the AMASS family, z-up by default."""
     if "format" in read_arrays(path, {}, {"format": "text "}):
         stored, usual = read_arrays(path, MOTION, version=MOTION_FORMAT), "y"
@@ -216,13 +216,13 @@ def _read_npz(path: Path, up: str | None, rest: np.ndarray, fps: float | None, u
     _check_own_rate(path, motion.fps)
     if len(motion.poses) == 0:
         return motion
-    motion = replace(motion, translations=np.float32(METRES[unit or "m"]) * motion.translations)
+    motion = replace(motion, translations=np.float32(METRES[units or "m"]) * motion.translations)
     places = joint_places(motion.poses[:FRAMES], rest)
     low, high = (places[:, _both(joint)].mean(axis=1) for joint in ("ankle", "shoulder"))
     up = settle_up(path, low, high, up, usual)
     check_joint_order(path, motion.poses[:FRAMES])
     motion = turn_up(motion, up)
-    check_travel(path, places @ Y_FROM[up].T, motion.translations[:FRAMES], motion.fps, unit)
+    check_travel(path, places @ Y_FROM[up].T, motion.translations[:FRAMES], motion.fps, units)
     return motion
 
 

@@ -41,10 +41,10 @@ def check_up(up: str | None) -> None:
         raise unknown_name("up", str(up), (*Y_FROM, AUTO))
 
 
-def check_unit(unit: str | None) -> None:
+def check_units(units: str | None) -> None:
     """Raises `AvatarError` for a unit of length that is not known."""
-    if unit not in (None, *METRES):
-        raise unknown_name("unit", str(unit), METRES)
+    if units not in (None, *METRES):
+        raise unknown_name("units", str(units), METRES)
 
 
 def joint_places(poses: np.ndarray, rest: np.ndarray) -> np.ndarray:
@@ -94,8 +94,8 @@ def settle_up(path: Path, low: np.ndarray, high: np.ndarray, up: str | None, usu
     return wanted
 
 
-def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float, unit: str | None) -> None:
-    """Refuses translations ``(T, 3)``, y up, in another unit than metres, unless a ``unit`` was given.
+def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float, units: str | None) -> None:
+    """Refuses translations ``(T, 3)``, y up, in another unit than metres, unless ``units`` are given.
 
     While a foot stands the pelvis moves against it: what it moves by, in metres, over what the file says is the unit.
     ``places (T, 22, 3)`` are joints about the pelvis. Also refused: more than 15 m/s; a rise of 3 m is warned about.
@@ -105,7 +105,7 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
     places, steps = places[::stride], np.diff(travel[::stride], axis=0)
     if len(travel) < 4 or not speed:
         return
-    hint = "Give unit=cm, mm, in or, if it is right, m."
+    hint = "Give units=cm, mm, in or, if it is right, m."
     feet = places[:, [INDEX[f"{side}_{joint}"] for side in ("left", "right") for joint in ("ankle", "foot")]]
     lowest = (feet[1:, :, 1] + feet[:-1, :, 1]).argmin(axis=1)
     moved = np.diff(feet, axis=0)[np.arange(len(steps)), lowest]
@@ -115,14 +115,14 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
     if len(steps) >= 10 and others[best] > PLANTED and explained < PLANTED / 2:
         told = "translations fit the feet (%.2f of 1, as they are %.2f) if they are turned up without the poses"
         log.warning(f"%s: {told}: correct the file if people fly.", path, others[best], explained)
-    if unit is None and len(steps) >= 10 and explained > PLANTED and 0 < scale < 0.1:
+    if units is None and len(steps) >= 10 and explained > PLANTED and 0 < scale < 0.1:
         near = min(METRES, key=lambda name: abs(np.log(METRES[name] / scale)))
         problem = f"expected translations in metres, feet stand still if their unit is {scale:.3g} m, which is {near}."
-        raise DataError(path, problem, f"Give unit={near} or, if they are in metres, unit=m.")
-    if unit is None and speed > FASTEST:
+        raise DataError(path, problem, f"Give units={near} or, if they are in metres, units=m.")
+    if units is None and speed > FASTEST:
         raise DataError(path, f"expected a pelvis slower than {FASTEST:g} m/s, it moves at {speed:.3g} m/s.", hint)
     if (rise := float(np.ptp(travel[:, 1]))) > RISE:
-        log.warning("%s: the pelvis rises and falls by %.1f m; give up= or unit= if people fly.", path, rise)
+        log.warning("%s: the pelvis rises and falls by %.1f m; give up= or units= if people fly.", path, rise)
 
 
 def _planted(moved: np.ndarray, steps: np.ndarray) -> tuple[float, float]:

@@ -141,7 +141,8 @@ def load_motion(
         legs = [pose_path(a, b, round(fps)) for a, b in itertools.pairwise(stops)]
         motion = Motion(np.concatenate([stops[0][None], *legs]), np.zeros(0), fps, source)
     elif Path(source).suffix in (".npz", ".bvh"):
-        given = {"joints": joints} if Path(source).suffix == ".bvh" else {"unit": "m"}  # any: translations are not used
+        # translations are not used, so their unit does not matter
+        given = {"joints": joints} if Path(source).suffix == ".bvh" else {"units": "m"}
         motion = read_motion(Path(source), fps, up, **given)
     else:
         known = ", ".join((*SEQUENCES, *EVERYDAY))

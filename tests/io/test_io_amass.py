@@ -173,11 +173,11 @@ def test_translations_in_other_units_are_noticed_by_the_feet(tmp_path, unit, met
     arrays = smpl_arrays(walk)
     np.savez(tmp_path / "a.npz", poses=wide(arrays, 156), trans=arrays["trans"] / metres, mocap_framerate=fps)
     with pytest.raises(
-        DataError, match=rf"in metres, feet stand still if their unit is .* which is {unit}\. Give unit="
+        DataError, match=rf"in metres, feet stand still if their unit is .* which is {unit}\. Give units="
     ):
         read_motion(tmp_path / "a.npz")
-    np.testing.assert_allclose(read_motion(tmp_path / "a.npz", unit=unit).translations, walk.translations, atol=1e-4)
-    assert np.ptp(read_motion(tmp_path / "a.npz", unit="m").translations) > 10
+    np.testing.assert_allclose(read_motion(tmp_path / "a.npz", units=unit).translations, walk.translations, atol=1e-4)
+    assert np.ptp(read_motion(tmp_path / "a.npz", units="m").translations) > 10
 
 
 @pytest.mark.parametrize("name", ["walk", "squat", "twist", "reach", "kick", "bend", "dance"])
@@ -202,12 +202,12 @@ def test_a_statue_that_is_moved_tells_no_unit(tmp_path, walk):
 def test_speeds_and_heights_of_no_person_are_noticed(tmp_path, walk, caplog):
     arrays = smpl_arrays(Motion(walk.poses, np.linspace([0, 0, 0], [0, 0, 60], len(walk.poses)), 30.0, "a"))
     np.savez(tmp_path / "a.npz", poses=wide(arrays, 156), trans=arrays["trans"], mocap_framerate=30)
-    with pytest.raises(DataError, match=r"slower than 15 m/s, it moves at 40\.9 m/s\. Give unit="):
+    with pytest.raises(DataError, match=r"slower than 15 m/s, it moves at 40\.9 m/s\. Give units="):
         read_motion(tmp_path / "a.npz")
     arrays = smpl_arrays(Motion(walk.poses, np.linspace([0, 0, 0], [0, 6, 0], len(walk.poses)), 30.0, "a"))
     np.savez(tmp_path / "a.npz", poses=wide(arrays, 156), trans=arrays["trans"], mocap_framerate=30)
     read_motion(tmp_path / "a.npz")
-    assert "rises and falls by 6.0 m; give up= or unit=" in caplog.text
+    assert "rises and falls by 6.0 m; give up= or units=" in caplog.text
 
 
 def test_translations_of_another_axis_than_poses_are_noticed(tmp_path, walk, caplog):
@@ -260,8 +260,8 @@ def test_options_that_a_format_has_no_use_for_are_refused(tmp_path, walk):
     write_motion(tmp_path / "a.npz", walk)
     with pytest.raises(AvatarError, match="joints: expected none"):
         read_motion(tmp_path / "a.npz", joints=tmp_path / "map.yaml")
-    with pytest.raises(AvatarError, match="unit: expected one of m, cm, mm, in, got 'km'"):
-        read_body_motion(tmp_path / "a.npz", open_body("mean"), unit="km")
+    with pytest.raises(AvatarError, match="units: expected one of m, cm, mm, in, got 'km'"):
+        read_body_motion(tmp_path / "a.npz", open_body("mean"), units="km")
     for ending, hint in ((".amc", "Blender"), (".fbx", "Blender"), (".pkl", "numpy.savez")):
         with pytest.raises(DataError, match=rf"ending in \.npz or \.bvh, got '{ending}'\. .*{hint}"):
             read_motion(tmp_path / f"a{ending}")

@@ -33,13 +33,13 @@ def test_a_file_that_says_neither_axis_nor_rate_nor_unit(run, tmp_path):
     for options, problem in (
         ("", "Give fps="),
         ("fps=30", "Give up=y, or up=z if people really lie down"),
-        ("fps=30 up=y", "Give unit=cm"),
+        ("fps=30 up=y", "Give units=cm"),
         ("fps=30 up=north", "up: expected one of y, z, -y, -z, auto, got 'north'"),
         ("fps=30 start=4 stop=2", "start, stop, step: expected 0 <= start < stop"),
     ):
         done = command(tmp_path, f"{predict} {options}")
         assert done.returncode == 2 and problem in done.stderr and "Traceback" not in done.stderr, done.stderr
-    chosen = "up=y unit=cm start=2 stop=10 step=4"
+    chosen = "up=y units=cm start=2 stop=10 step=4"
     done = command(tmp_path, f"{predict} fps=10 {chosen}")
     assert done.returncode == 0, done.stderr
     (folder,) = (run / "predictions" / "stroll").iterdir()
@@ -49,7 +49,7 @@ def test_a_file_that_says_neither_axis_nor_rate_nor_unit(run, tmp_path):
     assert np.ptp(first, axis=0).argmax() == 1  # upright
     assert (second - first).mean(axis=0)[2] == pytest.approx(0.04 / 14 * 100, abs=0.05)
     export = f"export.py run={run} predictions=stroll motion=stroll.npz"
-    done = command(tmp_path, f"{export} up=y unit=cm start=2 stop=10 step=2")
+    done = command(tmp_path, f"{export} up=y units=cm start=2 stop=10 step=2")
     assert done.returncode == 2 and "expected the 2 frames that were predicted, got 4. Give start=" in done.stderr
     assert command(tmp_path, f"{export} {chosen}").returncode == 0
 
