@@ -78,17 +78,22 @@ class Avatar:
         fps: float | None = None,
         points: int = 50_000,
         surface: ExtractionConfig | None = None,
+        up: str | None = None,
+        units: str | None = None,
+        joints: Path | str | None = None,
     ) -> Iterator[Surface]:
         """The dressed surface in every frame of a motion, one after another; see `pose`.
 
         A motion is an AMASS ``.npz``, a BVH file, one of our own, or arrays: of the body's own J joints, or of the 22
         of SMPL, whose rotations then go to the joints of those names. A file is resampled to ``fps`` frames a second,
-        its own if None. The points of a point method keep their order over time.
+        its own if None; ``up``, ``units`` and ``joints`` (a map file) give what it does not say itself (docs/data.md).
+        The points of a point method keep their order over time.
         """
         data = self._find(outfit)
         body = data.posable_body()
         if not isinstance(motion, Motion):
-            motion = read_body_motion(Path(motion), body, fps)
+            named = None if joints is None else Path(joints)
+            motion = read_body_motion(Path(motion), body, fps, up, units, joints=named)
         else:
             motion = self._own_joints(motion, body)
         dress = self.trained.method.predictor(self.trained, data.name, points, surface or ExtractionConfig())

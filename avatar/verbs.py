@@ -89,7 +89,7 @@ OPTIONS = {  # that a verb's help begins with, a dozen at most
     "train": "dataset outfit method size name train.minutes train.steps train.batch canonical data_root runs_root "
     "device",
     "fit": "run dataset outfit frame name steps points data_root runs_root device",
-    "predict": "run split motion fps up points checkpoint data_root device",
+    "predict": "run split motion fps up units joints points checkpoint data_root device",
     "evaluate": "runs split floors predictions label dataset outfit data_root out",
     "experiment": "experiment budget dataset outfit method size train.minutes train.steps split.train_fraction "
     "compare.out data_root runs_root",

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.open import open_body
+from avatar.io.stance import joint_places
 from avatar.records import Motion
 
 Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -67,6 +68,24 @@ def write_bvh(
     lines += [" ".join(f"{value:.9f}" for value in row) for row in np.concatenate(columns, axis=1)]
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def smpl_arrays(motion: Motion, basis: np.ndarray = Z_FROM_Y) -> dict[str, np.ndarray]:
+    """A y-up motion in a world turned by ``basis``: ``root (T, 3)``, ``body (T, 63)`` and ``trans (T, 3)``."""
+    root = Rotation.from_matrix(basis @ Rotation.from_rotvec(motion.poses[:, 0]).as_matrix()).as_rotvec()
+    body = motion.poses[:, 1:].reshape(len(root), 63).astype(np.float64)
+    return {"root": root, "body": body, "trans": motion.translations @ basis.T}
+
+
+def planted(motion: Motion, noise: float = 0.0) -> Motion:
+    """A motion that travels as its feet say: the lower of them stands still; ``noise`` metres a frame."""
+    rest = open_body("mean").template.joints.double().numpy()
+    feet = joint_places(motion.poses, rest)[:, [7, 8, 10, 11]]
+    lowest = (feet[1:, :, 1] + feet[:-1, :, 1]).argmin(axis=1)
+    steps = -np.diff(feet, axis=0)[np.arange(len(lowest)), lowest]
+    travel = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    travel += np.random.default_rng(0).normal(0, noise, travel.shape)
+    return Motion(motion.poses, travel.astype(np.float32), motion.fps, motion.name)
 
 
 def write_amass(path: Path, motion: Motion, extra: int = 90) -> Path:

@@ -1,12 +1,10 @@
-"""Motion files (AMASS npz, BVH, our own npz) as 22 joints in SMPL order, axis-angle, metres, y up; other skeletons'."""
+"""Motion files (AMASS npz, BVH, our own npz) as 22 joints in SMPL order, axis-angle, metres, y up; other skeletons."""
 
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +13,22 @@ from scipy.spatial.transform import Rotation
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.checks import AvatarError, DataError, check_suffix, plain_name
+from avatar.io.amass import read_smpl_arrays
 from avatar.io.bvh import BvhMotion, read_bvh
+from avatar.io.joint_names import INDEX, MAP_HINT, map_joints, read_joint_map
 from avatar.io.npz import naming, read_arrays, write_described
+from avatar.io.stance import (
+    FRAMES,
+    METRES,
+    Y_FROM,
+    check_joint_order,
+    check_sides,
+    check_travel,
+    check_units,
+    check_up,
+    joint_places,
+    settle_up,
+)
 from avatar.records import Motion
 
 log = logging.getLogger(__name__)
@@ -24,32 +36,7 @@ log = logging.getLogger(__name__)
 MOTION_FORMAT = "motion/1"
 JOINTS = len(SMPL_JOINTS)
 MOTION = {"poses": f"float T {JOINTS} 3", "translations": "float T 3", "fps": "number ", "name": "text "}
-AMASS = {"poses": "float T P", "root_orient": "float T 3", "pose_body": "float T 63"}
-AMASS_RATES = dict.fromkeys(("mocap_framerate", "mocap_frame_rate"), "number | 1")
 FRAME_RATES = (1.0, 1000.0)
-Y_FROM_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # z up to y up, about x
-# Our joint: what Mixamo, CMU and LAFAN skeletons call it, lower case, without prefix, spaces or signs.
-NAMES = {
-    "pelvis": ("hips", "pelvis", "root"),
-    "neck": ("neck",),
-    "head": ("head",),
-    **{
-        ours.format(side=side): tuple(name.format(side=side, s=side[0]) for name in theirs)
-        for side in ("left", "right")
-        for ours, theirs in {
-            "{side}_hip": ("{side}upleg", "{side}thigh", "{s}thigh", "{side}hip"),
-            "{side}_knee": ("{side}leg", "{side}shin", "{s}shin", "{side}lowleg", "{side}knee"),
-            "{side}_ankle": ("{side}foot", "{s}foot", "{side}ankle"),
-            "{side}_foot": ("{side}toebase", "{side}toe", "{s}toe"),
-            "{side}_collar": ("{side}shoulder", "{side}collar", "{s}clavicle", "{s}collar"),
-            "{side}_shoulder": ("{side}arm", "{side}uparm", "{side}upperarm", "{s}upperarm"),
-            "{side}_elbow": ("{side}forearm", "{side}lowarm", "{s}forearm", "{side}elbow"),
-            "{side}_wrist": ("{side}hand", "{s}hand", "{side}wrist"),
-        }.items()
-    },
-}
-NEEDED = [f"{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle", "shoulder", "elbow")]
-INDEX = {name: index for index, name in enumerate(SMPL_JOINTS)}
 LIMBS = [
     (INDEX[f"{side}_{joint}"], INDEX[f"{side}_{tip}"])
     for side in ("left", "right")
@@ -57,36 +44,120 @@ LIMBS = [
 ]
 NEAR_T_POSE = 65.0  # degrees between a limb at rest and in the T-pose; A-poses pass
 CALIBRATION_FRAMES = 200
+LEG = 0.8  # m from hip to ankle, by which a skeleton's unit is named
+ALL = slice(None)
+BLENDER = "Import it in Blender (File > Import; an add-on for ASF/AMC) and export as BVH."
+PICKLED = "Save its arrays by numpy.savez with the keys poses, trans and mocap_framerate: pickles are not read."
+OTHER_ENDINGS = {
+    **dict.fromkeys((".asf", ".amc", ".fbx", ".c3d", ".glb", ".gltf", ".dae", ".trc", ".usd", ".abc"), BLENDER),
+    **dict.fromkeys((".pkl", ".pickle", ".npy", ".json", ".pt", ".pth"), PICKLED),
+}
 
 
-def read_body_motion(path: Path, body: BodyModel, fps: float | None = None, up: str | None = None) -> Motion:
+@dataclass
+class MotionConfig:
+    """A motion file, and what it does not say itself."""
+
+    motion: Path | None = None  # AMASS .npz, BVH or one of our own: predicted instead of a split, exported as tracks
+    up: str | None = None  # y, z, -y, -z: the file's axis that points up; auto: as people stand; its format's if null
+    units: str | None = None  # m, cm, mm or in, of the translations of an .npz; metres if null, refused if feet say no
+    start: int = 0  # first frame of the file that is taken
+    stop: int | None = None  # frame of the file before which to stop; its end if null
+    step: int = 1  # every so many frames of the file; not resampled to 30 a second then
+    joints: Path | None = None  # YAML of SMPL's joint names to those of a BVH skeleton with other names
+
+    def __post_init__(self):
+        check_up(self.up)
+        check_units(self.units)
+        if self.start < 0 or self.step < 1 or (self.stop is not None and self.stop <= self.start):
+            got = f"start={self.start} stop={self.stop} step={self.step}"
+            raise AvatarError(f"start, stop, step: expected 0 <= start < stop and step of at least 1, got {got}.")
+
+    def read_motion(self, body: BodyModel, fps: float | None = None) -> Motion:
+        """The motion as poses of a body's own joints, see `read_body_motion`."""
+        if self.motion is None:
+            raise AvatarError("motion: expected a file, got none.")
+        frames = slice(self.start, self.stop, self.step)
+        return read_body_motion(self.motion, body, fps, self.up, self.units, frames, self.joints)
+
+
+def read_body_motion(
+    path: Path,
+    body: BodyModel,
+    fps: float | None = None,
+    up: str | None = None,
+    units: str | None = None,
+    frames: slice = ALL,
+    joints: Path | None = None,
+) -> Motion:
     """A motion file (`read_motion`) as poses of a body's own joints ``(T, J, 3)``.
 
     BVH skeletons are fitted to the body's proportions; translations of npz files (SMPL's ``trans``) are taken as they
     are. Raises `AvatarError` for a body whose joints have unknown names.
     """
-    return move_body(read_motion(path, fps, up, rest_joints(body)), body)
+    return move_body(read_motion(path, fps, up, rest_joints(body), units, frames, joints), body)
 
 
-def read_motion(path: Path, fps: float | None = None, up: str | None = None, rest: np.ndarray | None = None) -> Motion:
+def read_motion(
+    path: Path,
+    fps: float | None = None,
+    up: str | None = None,
+    rest: np.ndarray | None = None,
+    units: str | None = None,
+    frames: slice = ALL,
+    joints: Path | None = None,
+) -> Motion:
     """Reads a motion by its file's ending: ``.npz`` (AMASS SMPL, SMPL+H or SMPL-X, or our own) or ``.bvh``.
 
-    AMASS files are z-up and BVH files y-up unless ``up`` says otherwise; all come out y-up, at ``fps`` if given. BVH
-    skeletons are mapped by joint names and fitted in size to T-pose joints ``rest (22, 3)`` (the open body's if None).
-    Raises `DataError` for an invalid file or people who lie down; `AvatarError` for a bad ``up`` or ``fps``.
+    AMASS files are z-up and BVH files y-up unless ``up`` says otherwise ("auto": as people stand); all come out y-up.
+    The file's ``frames`` are taken, then resampled to ``fps``, at which they are if the file has no rate. BVH skeletons
+    are mapped by joint names, or those of a file ``joints`` (`read_joint_map`), and fitted in size to T-pose joints
+    ``rest (22, 3)`` (the open body's if None). Raises `DataError` for an invalid file, people who lie down or
+    translations that are not in metres or the given ``units``; `AvatarError` for a bad ``up``, ``units`` or ``fps``.
     """
     path = Path(path)
-    if up not in (None, "y", "z"):
-        raise AvatarError(f"up: expected y, z or nothing, got {up!r}.")
-    readers = {".npz": _read_npz, ".bvh": partial(_read_bvh, rest=rest)}
-    motion = readers[check_suffix(path, readers, "a motion file")](path, up)
-    low, high = FRAME_RATES
-    if len(motion.poses) == 0:
-        raise DataError(path, "expected at least one frame, got none.")
-    if not low <= motion.fps <= high:
-        raise DataError(path, f"expected {low:g} to {high:g} frames per second, got {motion.fps:g}.")
+    check_up(up)
+    check_units(units)
+    if fps is not None:
+        check_rate(fps)
+    _check_ending(path)
+    rest = open_body(MEAN_SHAPE).template.joints.double().numpy() if rest is None else rest
+    if path.suffix.lower() == ".bvh":
+        if units is not None:
+            raise AvatarError(f"units: expected none for {path}, BVH files are scaled by the skeleton's legs.")
+        motion = _read_bvh(path, up, rest, joints)
+    else:
+        if joints is not None:
+            raise AvatarError(f"joints: expected none for {path}, .npz files have SMPL's joints.")
+        motion = _read_npz(path, up, rest, fps and fps * (frames.step or 1), units)
+    motion = _take(motion, path, frames)
+    _check_own_rate(path, motion.fps)
     motion = replace(motion, source=path, name=plain_name(motion.name, "motion"))  # frames are files of that name
     return motion if fps is None else resample_motion(motion, fps)
+
+
+def _check_ending(path: Path) -> None:
+    """Refuses other files than .npz and .bvh, with the way to get one from others."""
+    if (ending := path.suffix.lower()) in OTHER_ENDINGS:
+        raise DataError(path, f"expected a motion file ending in .npz or .bvh, got {ending!r}.", OTHER_ENDINGS[ending])
+    check_suffix(path, (".npz", ".bvh"), "a motion file")
+
+
+def _check_own_rate(path: Path, fps: float) -> None:
+    low, high = FRAME_RATES
+    if not low <= fps <= high:
+        raise DataError(path, f"expected {low:g} to {high:g} frames per second, got {fps:g}.")
+
+
+def _take(motion: Motion, path: Path, frames: slice) -> Motion:
+    """The frames of a motion that a slice names; at least one."""
+    count = len(motion.poses)
+    if count == 0:
+        raise DataError(path, "expected at least one frame, got none.")
+    poses, translations = motion.poses[frames], motion.translations[frames]
+    if len(poses) == 0:
+        raise DataError(path, f"start, stop: expected frames of the {count} there, got {frames.start}:{frames.stop}.")
+    return replace(motion, poses=poses, translations=translations, fps=motion.fps / (frames.step or 1))
 
 
 def write_motion(path: Path, motion: Motion) -> None:
@@ -125,68 +196,59 @@ def resample_motion(motion: Motion, fps: float) -> Motion:
     )
 
 
-def turn_up(motion: Motion) -> Motion:
-    """A z-up motion turned y-up. The body then stands where it stood, up to a constant shift of its pelvis."""
-    root = Y_FROM_Z @ Rotation.from_rotvec(motion.poses[:, 0]).as_matrix()
+def turn_up(motion: Motion, up: str = "z") -> Motion:
+    """A motion turned from another axis to y-up. Bodies stand where they stood, up to a shift of the pelvis."""
+    if up == "y":
+        return motion
     poses = motion.poses.copy()
-    poses[:, 0] = Rotation.from_matrix(root).as_rotvec()
-    return replace(motion, poses=poses, translations=(motion.translations @ Y_FROM_Z.T).astype(np.float32))
+    poses[:, 0] = Rotation.from_matrix(Y_FROM[up] @ Rotation.from_rotvec(poses[:, 0]).as_matrix()).as_rotvec()
+    return replace(motion, poses=poses, translations=(motion.translations @ Y_FROM[up].T).astype(np.float32))
 
 
-def _read_npz(path: Path, up: str | None) -> Motion:
+def _read_npz(path: Path, up: str | None, rest: np.ndarray, fps: float | None, units: str | None) -> Motion:
     """Our own motion, y-up by default, or one of the AMASS family, z-up by default."""
-    if "format" not in read_arrays(path, {}, {"format": "text "}):
-        motion = _read_amass(path)
-        return motion if up == "y" else turn_up(motion)
-    stored = read_arrays(path, MOTION, version=MOTION_FORMAT)
-    motion = Motion(stored["poses"], stored["translations"], float(stored["fps"]), str(stored["name"]))
-    return turn_up(motion) if up == "z" else motion
-
-
-def _read_amass(path: Path) -> Motion:
-    """AMASS: ``poses (T, 3 joints)``, or ``root_orient`` and ``pose_body`` of the SMPL-X stage II files."""
-    stored = read_arrays(path, {"trans": "float T 3"}, AMASS | AMASS_RATES)
-    if "root_orient" in stored and "pose_body" in stored:
-        poses = np.concatenate([stored["root_orient"], stored["pose_body"]], axis=1)
-    elif "poses" in stored and stored["poses"].shape[1] >= 3 * JOINTS and stored["poses"].shape[1] % 3 == 0:
-        poses = stored["poses"][:, : 3 * JOINTS]
+    if "format" in read_arrays(path, {}, {"format": "text "}):
+        stored, usual = read_arrays(path, MOTION, version=MOTION_FORMAT), "y"
+        motion = Motion(stored["poses"], stored["translations"], float(stored["fps"]), str(stored["name"]))
     else:
-        got = f"poses {stored['poses'].shape}" if "poses" in stored else "neither"
-        raise DataError(path, f"expected poses (T, 66 or more), or root_orient and pose_body, got {got}.")
-    rates = [stored[key] for key in AMASS_RATES if key in stored]
-    if not rates:
-        raise DataError(path, f"expected {' or '.join(AMASS_RATES)}, found neither.")
-    poses = poses.reshape(len(poses), JOINTS, 3).astype(np.float32)
-    largest = float(np.linalg.norm(poses, axis=-1).max(initial=0))
-    if largest > 4 * np.pi:
-        raise DataError(path, f"poses: expected radians, got turns of {largest:.0f}.", "Convert degrees first.")
-    return Motion(poses, stored["trans"].astype(np.float32), float(rates[0].reshape(())), path.stem)
-
-
-def _read_bvh(path: Path, up: str | None, rest: np.ndarray | None) -> Motion:
-    """A BVH file on our joints; refuses people lying along another axis unless the caller says what is up."""
-    bvh = read_bvh(path)
-    if up == "z":
-        moved = {name: getattr(bvh, name) @ Y_FROM_Z.T for name in ("offsets", "positions")}
-        bvh = replace(bvh, rotations=Y_FROM_Z @ bvh.rotations @ Y_FROM_Z.T, **moved)
-    with naming(path):
-        source = map_joints(bvh.names, bvh.parents)
-        if up is None:
-            _check_upright(path, bvh, source)
-        motion = retarget(bvh, source, path.stem, rest)
-    log.info("%s: %d joints of %d mapped by name, size fitted to the body's legs.", path, len(source), len(bvh.names))
+        arrays = read_smpl_arrays(path, fps, rest[0])
+        motion, usual = Motion(arrays.poses, arrays.translations, arrays.fps, path.stem), arrays.usual_up
+    _check_own_rate(path, motion.fps)
+    if len(motion.poses) == 0:
+        return motion
+    motion = replace(motion, translations=np.float32(METRES[units or "m"]) * motion.translations)
+    places = joint_places(motion.poses[:FRAMES], rest)
+    low, high = (places[:, _both(joint)].mean(axis=1) for joint in ("ankle", "shoulder"))
+    up = settle_up(path, low, high, up, usual)
+    check_joint_order(path, motion.poses[:FRAMES])
+    motion = turn_up(motion, up)
+    check_travel(path, places @ Y_FROM[up].T, motion.translations[:FRAMES], motion.fps, units)
     return motion
 
 
-def _check_upright(path: Path, bvh: BvhMotion, source: dict[int, int]) -> None:
-    """Refuses a file whose people, on average, stretch along another axis than y."""
-    legs = [source[INDEX[f"{side}_ankle"]] for side in ("left", "right")]
-    upper = source[INDEX["left_shoulder"]]
-    stretch = (bvh.positions[:, upper] - bvh.positions[:, legs].mean(axis=1)).mean(axis=0)
-    share = stretch / max(np.linalg.norm(stretch), 1e-12)
-    if share[1] < 0.5 and abs(share[2]) > 0.8:
-        hint = "Give up=z, or up=y if people really lie down."
-        raise DataError(path, "expected people upright along y, they are upright along z.", hint)
+def _both(joint: str) -> list[int]:
+    return [INDEX[f"{side}_{joint}"] for side in ("left", "right")]
+
+
+def _read_bvh(path: Path, up: str | None, rest: np.ndarray, joints: Path | None) -> Motion:
+    """A BVH file on our joints, turned y-up."""
+    bvh, given = read_bvh(path), read_joint_map(joints)
+    with naming(path, MAP_HINT):
+        source = map_joints(bvh.names, bvh.parents, given)
+    with naming(path):
+        low, high = (bvh.positions[:, [source[j] for j in _both(name)]].mean(axis=1) for name in ("ankle", "shoulder"))
+        turn = Y_FROM[settle_up(path, low, high, up, "y")]
+        moved = {name: getattr(bvh, name) @ turn.T for name in ("offsets", "positions")}
+        bvh = replace(bvh, rotations=turn @ bvh.rotations @ turn.T, **moved)
+        check_sides(path, bvh.positions, source)
+        motion = retarget(bvh, source, path.stem, rest)
+        leg = _leg_length(_rest_places(bvh), source)
+    unit = min(METRES, key=lambda name: abs(np.log(METRES[name] * leg / LEG)))
+    told = (
+        "%s: %d joints of %d mapped by name, size fitted to the body's legs: one of %.3g here, which is likely in %s."
+    )
+    log.info(told, path, len(source), len(bvh.names), leg, unit)
+    return motion
 
 
 def retarget(bvh: BvhMotion, source: dict[int, int], name: str, rest: np.ndarray | None = None) -> Motion:
@@ -197,9 +259,7 @@ def retarget(bvh: BvhMotion, source: dict[int, int], name: str, rest: np.ndarray
     move with their parents. Translations are scaled by leg lengths, so units do not matter.
     """
     rest = open_body(MEAN_SHAPE).template.joints.double().numpy() if rest is None else rest
-    offsets = np.zeros_like(bvh.offsets)  # joint positions at rest, the root at the origin
-    for joint, parent in enumerate(bvh.parents[1:], start=1):
-        offsets[joint] = offsets[parent] + bvh.offsets[joint]
+    offsets = _rest_places(bvh)
     aligned = _aligned_rest(source, rest, offsets)
     if aligned is None:
         turns = _calibrated_turns(bvh, source, rest)
@@ -235,31 +295,12 @@ def rest_joints(body: BodyModel) -> np.ndarray:
     return rest
 
 
-def map_joints(names: Sequence[str], parents: Sequence[int]) -> dict[int, int]:
-    """Our joint index to a skeleton's, by SMPL's names or other common ones; `AvatarError` names those not found.
-
-    The joints between hips and neck are shared over the spine.
-    """
-    exact = {INDEX[name]: index for index, name in enumerate(names) if name in INDEX}
-    if all(INDEX[joint] in exact for joint in NEEDED):
-        return dict(sorted(exact.items()))
-    plain = {re.sub(r"[^a-z0-9]", "", name.rpartition(":")[2].lower()): i for i, name in enumerate(names)}
-    plain = {re.sub(r"^mixamorig\d*", "", name): index for name, index in plain.items()}
-    there = {joint: [plain[name] for name in known if name in plain] for joint, known in NAMES.items()}
-    found = {INDEX[joint]: indices[0] for joint, indices in there.items() if indices}
-    found.setdefault(0, 0)
-    missing = [joint for joint in NEEDED if INDEX[joint] not in found]
-    if missing:
-        problem = f"found none for {', '.join(missing)} among {', '.join(names[:40])}."
-        raise AvatarError(f"joints: expected the names of a SMPL, Mixamo, CMU or LAFAN skeleton, {problem}")
-    upper = found.get(INDEX["neck"], found[INDEX["left_shoulder"]])
-    chain = []
-    while (upper := parents[upper]) > found[0]:
-        chain.insert(0, upper)
-    chain = [index for index in chain if index not in found.values()]
-    spine = {1: ("spine3",), 2: ("spine1", "spine3")}.get(len(chain), ("spine1", "spine2", "spine3"))
-    found |= {INDEX[joint]: index for joint, index in zip(reversed(spine), reversed(chain))}
-    return dict(sorted(found.items()))
+def _rest_places(bvh: BvhMotion) -> np.ndarray:
+    """Joint positions ``(J, 3)`` at rest, the root at the origin."""
+    places = np.zeros_like(bvh.offsets)
+    for joint, parent in enumerate(bvh.parents[1:], start=1):
+        places[joint] = places[parent] + bvh.offsets[joint]
+    return places
 
 
 def _local_poses(turns: dict[int, np.ndarray], parents: Sequence[int], frames: int) -> np.ndarray:

@@ -22,7 +22,7 @@ from avatar.implicit.extraction import ExtractionConfig
 from avatar.io.documents import read_json
 from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.io.locks import lock_folder
-from avatar.io.motions import read_body_motion
+from avatar.io.motions import MotionConfig, resample_motion
 from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
 from avatar.methods.settings import RunConfig
@@ -30,18 +30,17 @@ from avatar.nn.decoders import Normals
 from avatar.runs.prediction import predict_frames
 from avatar.runs.training import load_avatar
 
-MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second
+MOTION = "motion.json"  # in the folder of a predicted motion: its frames a second, and how many there are
+DEFAULT_RATE = 30.0  # frames a second of predicted motions
 
 
 @dataclass
-class PredictConfig:
+class PredictConfig(MotionConfig):
     """Posed point clouds from a trained run, for the frames of a split or for a motion file."""
 
     run: Path = Path("runs/closet/sample/dress/default")
     split: str = "test"  # or interpolation; validation, the frames that the run held back from training; train
-    motion: Path | None = None  # an AMASS .npz, a BVH file or one of our own; instead of the split
-    fps: float = 30.0  # frames a second a motion is resampled to
-    up: str | None = None  # y or z, which axis of the motion's file points up; its format's own if null
+    fps: float | None = None  # frames a second a motion is resampled to, 30 if null; its own where the file has none
     points: int = 50000  # 1,000 to 400,000
     surface: ExtractionConfig = field(default_factory=ExtractionConfig)  # of an implicit avatar
     checkpoint: str = "last"  # or best, on the held-back frames
@@ -96,7 +95,9 @@ def predict(config: PredictConfig) -> list[Path]:
     """Predicts every outfit of a run; gives the folders of point clouds. A motion needs bodies that can be posed."""
     avatar, folders = load_avatar(config.run, config.checkpoint, config.device), []
     for outfit in run_outfits(avatar, config.data_root):
-        motion = config.motion and read_body_motion(config.motion, outfit.posable_body(), config.fps, config.up)
+        motion = config.motion and config.read_motion(outfit.posable_body(), config.fps)
+        if motion and config.fps is None and config.step == 1:
+            motion = resample_motion(motion, DEFAULT_RATE)
         name = motion.name if motion else config.split
         folders.append(predictions_folder(config.run, name, outfit.name))
         where = (folders[-1], meshes_folder(config.run, name, outfit.name), config.points, config.surface)
@@ -104,14 +105,20 @@ def predict(config: PredictConfig) -> list[Path]:
         if motion:
             for path in set(folders[-1].glob(f"{motion.name}.*.ply")) - set(written):
                 path.unlink()  # the end of an earlier prediction with more frames a second
-            write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps}).encode())
+            write_whole(folders[-1] / MOTION, json.dumps({"fps": motion.fps, "frames": len(motion.poses)}).encode())
     return folders
 
 
 def predicted_fps(folder: Path) -> float:
     """The frames a second that a motion was predicted at; 30 for the frames of a split."""
     path = folder / MOTION
-    return float(read_json(path)["fps"]) if path.is_file() else 30.0
+    return float(read_json(path)["fps"]) if path.is_file() else DEFAULT_RATE
+
+
+def predicted_count(folder: Path) -> int | None:
+    """The frames that a motion was predicted in; None where that was not noted."""
+    path = folder / MOTION
+    return read_json(path).get("frames") if path.is_file() else None
 
 
 @prepared_process()

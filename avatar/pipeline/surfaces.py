@@ -15,12 +15,13 @@ from avatar.export.pictures import frame_camera, render_points
 from avatar.export.rigged import write_rigged_glb
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh
-from avatar.io.motions import read_body_motion
+from avatar.io.motions import MotionConfig
 from avatar.io.points import read_points
 from avatar.io.textures import FILES as TEXTURE_FILES
 from avatar.io.textures import TEXTURED, read_texture, write_textured_mesh
-from avatar.pipeline.scores import meshes_folder, predicted_fps, predictions_folder, run_outfits
+from avatar.pipeline.scores import meshes_folder, predicted_count, predicted_fps, predictions_folder, run_outfits
 from avatar.progress import tracked
+from avatar.records import Motion
 from avatar.runs.texturing import FOLDER as TEXTURE
 from avatar.runs.training import load_avatar
 
@@ -43,17 +44,16 @@ class MeshConfig:
 
 
 @dataclass
-class ExportConfig:
+class ExportConfig(MotionConfig):
     """Animation files of a predicted sequence: USD caches of points and meshes, a rigged body, a moving picture."""
 
     run: Path = Path("runs/closet/sample/dress/default")
     predictions: str = "walk"  # the motion that was predicted
     fps: float | None = None  # frames a second; those that a motion was predicted at if null, 30 for frames of a split
-    motion: Path | None = None  # the motion's file, for the rigged body's joint tracks
-    up: str | None = None  # y or z, which axis of the motion's file points up; its format's own if null
     data_root: Path | None = None  # where the data are now; where they were at training if null
 
     def __post_init__(self):
+        super().__post_init__()
         check_name("predictions", self.predictions)
 
 
@@ -125,7 +125,8 @@ def export(config: ExportConfig) -> list[Path]:
         folder = predictions_folder(config.run, config.predictions, outfit.name)
         fps, motion = config.fps or predicted_fps(folder), None
         if config.motion and outfit.body is not None:
-            motion = read_body_motion(config.motion, outfit.body, fps, config.up)
+            motion = config.read_motion(outfit.body, fps)
+            check_same_frames(config, folder, motion)
         jobs.append((outfit, folder, fps, motion))
     for outfit, folder, fps, motion in jobs:  # all motions were read by now
         meshes = meshes_folder(config.run, config.predictions, outfit.name)
@@ -140,6 +141,14 @@ def export(config: ExportConfig) -> list[Path]:
             write_rigged_glb(target / "body.glb", outfit.body, motion)
             written.append(target / "body.glb")
     return written
+
+
+def check_same_frames(config: ExportConfig, folder: Path, motion: Motion) -> None:
+    """Refuses a motion of another number of frames than was predicted, at the same rate."""
+    predicted, read = predicted_count(folder), len(motion.poses)
+    if predicted is not None and predicted != read and motion.fps == predicted_fps(folder):
+        problem = f"expected the {predicted} frames that were predicted, got {read}."
+        raise DataError(config.motion, problem, "Give start=, stop= and step= as to predict.")
 
 
 def numbered_frames(names: Iterable[str]) -> dict[str, dict[int, str]]:

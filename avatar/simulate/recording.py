@@ -23,7 +23,8 @@ from avatar.checks import AvatarError, DataError, check_range, unknown_name
 from avatar.environment import prepared_process
 from avatar.io.frames import OpenGarment, read_open_frame, read_open_garment, write_manifest, write_open_garment
 from avatar.io.ledger import Ledger, digest_of, file_digest
-from avatar.io.motions import read_motion, resample_motion
+from avatar.io.motions import read_motion
+from avatar.io.stance import check_up
 from avatar.processes import in_workers
 from avatar.progress import tracked
 from avatar.records import Motion
@@ -69,6 +70,8 @@ class SimulateConfig:
     interpolation: int | None = None  # settled frames of unseen random poses, a test split of its own
     train_motions: list[FileName] = field(default_factory=list)  # everyday families, authored sequences, files
     test_motions: list[FileName] = field(default_factory=list)  # the same for the test split
+    up: str | None = None  # y, z, -y or -z, the axis of motion files that points up, or auto; their format's if null
+    joints: Path | None = None  # YAML of SMPL's joint names to those of BVH skeletons with other names
     settled: bool = False  # record motion files as settled poses, spread over them, not as continuous sequences
     fps: float = 30.0  # frames per second of continuous sequences
     seconds: float = 3.0  # longest part taken of a sequence
@@ -97,6 +100,7 @@ class SimulateConfig:
             if (getattr(self, name) or 0) < 0:
                 raise AvatarError(f"{name}: expected a number of at least 0, got {getattr(self, name)}.")
         check_range(self, "seconds", above=0)
+        check_up(self.up)
         check_timing(self.fps, self.seconds)
 
 
@@ -122,10 +126,12 @@ def dressed_outfits(config: SimulateConfig) -> list[tuple[str, OutfitConfig]]:
     return found
 
 
-def load_motion(source: str, fps: float, seconds: float, seed: int = 0) -> Motion:
+def load_motion(
+    source: str, fps: float, seconds: float, seed: int = 0, up: str | None = None, joints: Path | None = None
+) -> Motion:
     """An authored or everyday sequence by name, or a motion file without its translation (the pelvis stays in place).
 
-    An everyday sequence passes one drawn pose of its family a second.
+    An everyday sequence passes one drawn pose of its family a second. ``up`` and ``joints`` as in `read_motion`.
     """
     check_timing(fps, seconds)
     if source in SEQUENCES:
@@ -135,7 +141,9 @@ def load_motion(source: str, fps: float, seconds: float, seed: int = 0) -> Motio
         legs = [pose_path(a, b, round(fps)) for a, b in itertools.pairwise(stops)]
         motion = Motion(np.concatenate([stops[0][None], *legs]), np.zeros(0), fps, source)
     elif Path(source).suffix in (".npz", ".bvh"):
-        motion = resample_motion(read_motion(Path(source)), fps)
+        # translations are not used, so their unit does not matter
+        given = {"joints": joints} if Path(source).suffix == ".bvh" else {"units": "m"}
+        motion = read_motion(Path(source), fps, up, **given)
     else:
         known = ", ".join((*SEQUENCES, *EVERYDAY))
         raise AvatarError(f"motion: expected {known} or a .npz or .bvh file, got {source!r}.")
@@ -145,7 +153,9 @@ def load_motion(source: str, fps: float, seconds: float, seed: int = 0) -> Motio
 
 def load_motions(config: SimulateConfig, sources: Sequence[str]) -> list[Motion]:
     """Motions as long and as fine as configured."""
-    return [load_motion(source, config.fps, config.seconds, config.seed) for source in sources]
+    return [
+        load_motion(source, config.fps, config.seconds, config.seed, config.up, config.joints) for source in sources
+    ]
 
 
 def spread_poses(motions: list[Motion], count: int) -> list[NamedPose]:

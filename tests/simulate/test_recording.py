@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from motion_files import Z_FROM_Y, write_bvh
 
 from avatar.body.open import open_body
 from avatar.body.packed import write_body, write_template
@@ -14,6 +15,7 @@ from avatar.checks import AvatarError, DataError
 from avatar.io.frames import OpenFrame, OpenGarment, read_open_frame, write_open_frame, write_open_garment
 from avatar.records import Motion
 from avatar.simulate import gates as gates_module
+from avatar.simulate.angles import authored_motion
 from avatar.simulate.dressing import Rest, bind_pose, pose_path, subject
 from avatar.simulate.gates import (
     GateConfig,
@@ -247,3 +249,13 @@ def test_everyday_sequences_pass_their_poses_smoothly():
     stops = everyday_poses("stride", 3, 3)
     np.testing.assert_allclose(motion.poses[[0, 10, 20]], stops, atol=1e-5)
     assert np.abs(np.diff(motion.poses, axis=0)).max() < 0.3
+
+
+def test_a_z_up_motion_file_is_recorded_upright(tmp_path):
+    walk = authored_motion("walk", 30, 0.5)
+    path = str(write_bvh(tmp_path / "walk.bvh", walk, basis=Z_FROM_Y))
+    with pytest.raises(DataError, match="Give up=z"):
+        load_motion(path, 30.0, 1.0)
+    np.testing.assert_allclose(load_motion(path, 30.0, 1.0, up="z").poses, walk.poses, atol=1e-4)
+    with pytest.raises(AvatarError, match="up: expected one of y, z"):
+        SimulateConfig(up="north")
