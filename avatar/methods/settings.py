@@ -118,6 +118,7 @@ class RunConfig:
     canonical: str = "default"  # name of the canonicalizers' runs, for space=canonical and learned skinning
     train: TrainConfig = field(default_factory=TrainConfig)
     device: str = "auto"  # auto takes CUDA where there is one
+    spent: float = 0.0  # seconds spent for the run before its training (an experiment's front end); tables add them
 
     def __post_init__(self):
         names = {"name": self.name, "method.variant": self.method.variant, "canonical": self.canonical}

@@ -234,11 +234,12 @@ def charged(config: ExperimentConfig, makers: Sequence[CanonicalizeConfig]) -> R
     run, minutes = config.run, config.train.minutes
     if not (config.front_end and minutes):
         return run
-    left = minutes - sum(front_end_seconds(settings.folder) for settings in makers) / 60
+    spent = sum(front_end_seconds(settings.folder) for settings in makers)
+    left = minutes - spent / 60
     if left <= 0:
         problem = f"expected more than the front end took, {minutes - left:.1f} minutes, got {minutes:g}."
         raise AvatarError(f"train.minutes: {problem} Hint: fewer steps of the canonicalizer, or front_end=false.")
-    return replace(run, train=replace(run.train, minutes=left))
+    return replace(run, spent=spent, train=replace(run.train, minutes=left))
 
 
 def canonicalizer_of(config: JobConfig, outfit: str) -> CanonicalizeConfig:

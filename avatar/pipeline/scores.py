@@ -180,7 +180,7 @@ def label_of(avatar: TrainedAvatar, **more: str) -> Label:
         variant=variant_of(settings),
         seed=settings.train.seed,
         steps=avatar.steps,
-        seconds=avatar.seconds,
+        seconds=avatar.seconds + avatar.config.spent,
         commit=current_commit(),
         fraction=settings.split.train_fraction,
         **more,

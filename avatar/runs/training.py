@@ -66,7 +66,7 @@ def save_settings(config: RunConfig) -> None:
     path, plain = config.folder / "config.yaml", settings_to_dict(config)
     if path.is_file():
         before, now = {"train.clock": "wall"} | flatten(read_yaml(path)), flatten(plain)  # older runs name no clock
-        free = {"train.steps", "train.minutes", "train.save_every", "train.log_every", "device", "data_root"}
+        free = {"train.steps", "train.minutes", "train.save_every", "train.log_every", "device", "data_root", "spent"}
         free |= {"pictures", "scored"}  # of canonicalizers' runs
         if changed := [key for key in sorted((before | now).keys() - free) if before.get(key) != now.get(key)]:
             raise AvatarError(

@@ -31,6 +31,8 @@ from avatar.pipeline.experiments import (
     tabulate_experiment,
 )
 from avatar.pipeline.reporting import CompareConfig, compare
+from avatar.pipeline.scores import label_of
+from avatar.runs.training import load_avatar
 
 ROOT = Path(__file__).parents[2]
 METRICS = ("cd_point", "normal_l1")
@@ -201,7 +203,11 @@ def test_a_method_that_takes_a_canonicalizer_gets_it_made_and_scored(first, tiny
     assert charged(timed, makers).train.minutes == 15
     timed = replace(timed, front_end=True)
     assert charged(timed, makers).train.minutes == pytest.approx(15 - counted / 60)
+    assert charged(timed, makers).spent == counted and charged(timed, []).spent == 0
     assert charged(timed, makers).folder == timed.run.folder and charged(timed, []).train.minutes == 15
+    avatar = load_avatar(run)
+    started = replace(avatar, config=replace(avatar.config, spent=60.0))
+    assert label_of(started).seconds == label_of(avatar).seconds + 60  # what tables show
     with pytest.raises(AvatarError, match=r"train\.minutes: expected more than the front end took"):
         charged(replace(timed, train=replace(timed.train, minutes=counted / 60)), makers)
 
