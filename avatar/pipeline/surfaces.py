@@ -14,7 +14,7 @@ from avatar.export.meshing import MeshingReport, PoissonConfig, mesh_folder
 from avatar.export.pictures import frame_camera, render_points
 from avatar.export.rigged import write_rigged_glb
 from avatar.io.ledger import Ledger, file_digest, keyed
-from avatar.io.meshes import read_mesh
+from avatar.io.meshes import read_mesh, write_mesh
 from avatar.io.motions import MotionConfig
 from avatar.io.points import read_points
 from avatar.io.textures import FILES as TEXTURE_FILES
@@ -25,7 +25,7 @@ from avatar.records import Motion
 from avatar.runs.texturing import FOLDER as TEXTURE
 from avatar.runs.training import load_avatar
 
-SOURCE = ("avatar.io.textures",)  # what makes textured meshes
+SOURCE = ("avatar.io.meshes", "avatar.io.textures")  # what writes meshes
 log = logging.getLogger(__name__)
 
 
@@ -60,8 +60,8 @@ class ExportConfig(MotionConfig):
 @prepared_process()
 def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
     """Meshes the predictions of every outfit of a run into ``<run>/meshes/<split>/<outfit>``. Frames that could not be
-    meshed are an `AvatarError` after all of them. Where predicting has written meshes, and the run has a texture
-    that fits them, they are written again with it (`texture_folder`).
+    meshed are an `AvatarError` after all of them. Where predicting has written meshes of the method's own, they are
+    written in the other formats, with the run's texture where it has one (`convert_folder`).
     """
     avatar, reports = load_avatar(config.run), {}
     for name in avatar.config.outfit:
@@ -71,7 +71,7 @@ def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
         frames = spaced_frames(sorted(path.stem for path in folder.glob("*.ply")), config.frames)
         target = meshes_folder(config.run, config.predictions, name)
         if avatar.method.makes_meshes:  # predicting has written its own surfaces
-            reports[target] = texture_folder(config, target, frames)
+            reports[target] = convert_folder(config, target, frames)
             continue
         reports[target] = mesh_folder(folder, target, config.formats, frames, config.poisson)
     if failed := {frame: why for report in reports.values() for frame, why in report.failed.items()}:
@@ -80,29 +80,39 @@ def mesh(config: MeshConfig) -> dict[Path, MeshingReport]:
     return reports
 
 
-def texture_folder(config: MeshConfig, folder: Path, frames: list[str]) -> MeshingReport:
-    """Writes a folder's meshes ``<frame>.ply`` as OBJ and GLB with the run's texture, where it has one of their faces.
+def convert_folder(config: MeshConfig, folder: Path, frames: list[str]) -> MeshingReport:
+    """Writes a folder's meshes ``<frame>.ply`` as the other formats, with the run's texture where it has their faces.
 
     PLY stays as it is; frames whose files are still right are not written again.
     """
-    wanted, source = [ending for ending in config.formats if f".{ending}" in TEXTURED], config.run / TEXTURE
-    if not wanted or not (source / TEXTURE_FILES[0]).is_file():
+    wanted, source = [ending for ending in config.formats if ending != "ply"], config.run / TEXTURE
+    if not wanted:
         return MeshingReport(skipped=tuple(frames))
-    texture, ledger, written, skipped = read_texture(source), Ledger(folder), [], []
-    pictured = [file_digest(source / name) for name in TEXTURE_FILES]
-    for name in tracked(frames, "textured meshes"):
+    texture = read_texture(source) if (source / TEXTURE_FILES[0]).is_file() else None
+    pictured = [file_digest(source / name) for name in TEXTURE_FILES] if texture else None
+    ledger, written, skipped = Ledger(folder), [], []
+    for name in tracked(frames, "mesh files", unit="frame"):
         path = folder / f"{name}.ply"
         if not path.is_file():
             raise DataError(path, "expected the mesh that predicting writes, there is none.", "Predict again.")
         key = keyed(SOURCE, mesh=file_digest(path), texture=pictured, formats=wanted)
-        if ledger.find(f"{name} textured", key):
+        if ledger.find(f"{name} formats", key):
             skipped.append(name)
             continue
-        if not texture.fits(found := read_mesh(path)):
-            log.warning("%s: the texture is of other faces, and was left out. Make it again: tools/texture.py.", path)
-            return MeshingReport(tuple(written), tuple(name for name in frames if name not in written))
-        files = [write_textured_mesh(folder / f"{name}.{ending}", found, texture) for ending in wanted]
-        ledger.record(f"{name} textured", key, [file for some in files for file in some])
+        found = read_mesh(path)
+        if texture and not texture.fits(found):
+            log.warning("%s: the texture is of other faces, and is left out. Make it again: tools/texture.py.", path)
+            texture = pictured = None
+            key = keyed(SOURCE, mesh=file_digest(path), texture=pictured, formats=wanted)
+        files = []
+        for ending in wanted:
+            target = folder / f"{name}.{ending}"
+            if texture and target.suffix in TEXTURED:
+                files += write_textured_mesh(target, found, texture)
+            else:
+                write_mesh(target, found)
+                files.append(target)
+        ledger.record(f"{name} formats", key, files)
         written.append(name)
     return MeshingReport(tuple(written), tuple(skipped))
 

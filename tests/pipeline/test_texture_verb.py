@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -120,4 +121,9 @@ def test_the_verb_bakes_keeps_and_meshes_with_the_texture(runs):
     (meshes / "check.00000.obj").unlink()
     other = call("mesh", f"run={run}", "frames=1")
     assert other.returncode == 0 and "the texture is of other faces" in other.stdout + other.stderr
-    assert not (meshes / "check.00000.obj").exists()
+    assert "usemtl" not in (meshes / "check.00000.obj").read_text()
+    shutil.rmtree(folder)
+    assert call("mesh", f"run={run}", "formats=[obj,glb]").returncode == 0  # a run without texture
+    assert (
+        all("usemtl" not in path.read_text() for path in meshes.glob("*.obj")) and len(list(meshes.glob("*.glb"))) == 3
+    )

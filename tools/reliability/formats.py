@@ -213,7 +213,9 @@ def make_motion(folder: Path) -> Path:
 def make_amass(folder: Path) -> Path:
     """A motion as AMASS has it."""
     rng = np.random.default_rng(0)
-    np.savez(folder / "amass.npz", poses=rng.normal(size=(5, 156)) * 0.2, trans=np.zeros((5, 3)), mocap_framerate=60.0)
+    poses = rng.normal(size=(5, 156)) * 0.2
+    poses[:, 0] += np.pi / 2  # upright along z
+    np.savez(folder / "amass.npz", poses=poses, trans=np.zeros((5, 3)), mocap_framerate=60.0)
     return folder / "amass.npz"
 
 
