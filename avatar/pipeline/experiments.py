@@ -191,10 +191,12 @@ def experiment(config: ExperimentConfig) -> Path | list[Path]:
     if config.compare.pictures:
         load_pyvista()
     for settings in makers:
-        with lock_folder(settings.folder, wait=True), counted(settings.folder):  # another job may be making it
-            make_canonical_scans(settings, settings.frames())
+        with lock_folder(settings.folder, wait=True):  # another job may be making it
+            with counted(settings.folder, "canonicalizer", "scans/*/*.npz"):
+                make_canonical_scans(settings, settings.frames())
             if CLOTHED_TEMPLATE in needs_of(config):
-                make_template(template_of(config, settings.outfit))
+                with counted(settings.folder, "template", "template/*.npz"):
+                    make_template(template_of(config, settings.outfit))
     run = train(charged(config, makers))
     made = {"points": config.points, "surface": config.surface, "device": config.device}
     for split in config.compare.splits if is_main else ():  # what the folder's ledgers know is not done again
@@ -205,25 +207,37 @@ def experiment(config: ExperimentConfig) -> Path | list[Path]:
 
 
 @contextmanager
-def counted(folder: Path) -> Iterator[None]:
-    """Adds a block's processor time to a canonicalizer's `FRONT_END`, where the block makes scans or a template."""
-    made, started = newest_file(folder), time.process_time()
-    yield
-    if newest_file(folder) > made:
-        seconds = front_end_seconds(folder) + time.process_time() - started
-        write_whole(folder / FRONT_END, json.dumps({"processor_seconds": round(seconds, 1)}).encode())
+def counted(folder: Path, part: str, made: str) -> Iterator[None]:
+    """Keeps the processor time of a block that makes the files ``made`` (a pattern) in a canonicalizer's `FRONT_END`.
+
+    What is interrupted counts together with what goes on from there; what is made anew counts once.
+    """
+    before, started, finished = newest_file(folder, made), time.process_time(), False
+    try:
+        yield
+        finished = True
+    finally:
+        if newest_file(folder, made) > before or not finished:
+            record = front_end_record(folder)
+            seconds, whole = record.get(part, (0.0, True))
+            elapsed = round(time.process_time() - started + (0 if whole else seconds), 1)
+            write_whole(folder / FRONT_END, json.dumps(record | {part: (elapsed, finished)}).encode())
 
 
-def newest_file(folder: Path) -> float:
-    """When the newest of a canonicalizer's scans and template files was written; 0 where there is none."""
-    files = [*folder.glob("scans/*/*.npz"), *folder.glob("template/*.npz")]
-    return max((path.stat().st_mtime for path in files), default=0.0)
+def newest_file(folder: Path, made: str) -> float:
+    """When the newest file of a pattern in a folder was written; 0 where there is none."""
+    return max((path.stat().st_mtime for path in folder.glob(made)), default=0.0)
+
+
+def front_end_record(folder: Path) -> dict[str, tuple[float, bool]]:
+    """The parts of a canonicalizer's front end: processor seconds, and whether the part was finished."""
+    path = folder / FRONT_END
+    return {part: tuple(values) for part, values in read_json(path).items()} if path.is_file() else {}
 
 
 def front_end_seconds(folder: Path) -> float:
-    """Processor seconds that a canonicalizer's folder has taken so far."""
-    path = folder / FRONT_END
-    return float(read_json(path)["processor_seconds"]) if path.is_file() else 0.0
+    """Processor seconds that a canonicalizer's folder has taken."""
+    return sum(seconds for seconds, _ in front_end_record(folder).values())
 
 
 def charged(config: ExperimentConfig, makers: Sequence[CanonicalizeConfig]) -> RunConfig:

@@ -1,9 +1,11 @@
 """Experiments: jobs make rows, rows make a table; what is finished is not done again, what fails stops nothing."""
 
+import itertools
 import os
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +28,7 @@ from avatar.pipeline.experiments import (
     ExperimentConfig,
     canonicalizers_of,
     charged,
+    counted,
     experiment,
     front_end_seconds,
     tabulate_experiment,
@@ -235,3 +238,30 @@ def test_one_command_runs_all_jobs_names_the_failure_and_tables_the_rest(tiny_fo
     assert "written: runs/tables/closet5.*" in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"data", "runs"}
     assert published == {path: path.stat().st_mtime_ns for path in published}  # not what this checkout publishes
+
+
+def test_a_front_end_that_goes_on_counts_together_and_one_made_anew_counts_once(tmp_path):
+    def work(seconds: float) -> None:
+        started = time.process_time()
+        while time.process_time() < started + seconds:
+            pass
+
+    def make(seconds: float, fail: bool = False) -> None:
+        with counted(tmp_path, "template", "*.npz"):
+            work(seconds)
+            if fail:
+                raise KeyboardInterrupt
+            (tmp_path / "template.npz").write_bytes(b"")
+            os.utime(tmp_path / "template.npz", (next(clock), next(clock)))
+
+    clock = itertools.count(1)
+    with pytest.raises(KeyboardInterrupt):
+        make(0.4, fail=True)
+    assert front_end_seconds(tmp_path) == pytest.approx(0.4, abs=0.11)
+    make(0.4)
+    assert front_end_seconds(tmp_path) == pytest.approx(0.8, abs=0.21)
+    make(0.3)
+    assert front_end_seconds(tmp_path) == pytest.approx(0.3, abs=0.11)
+    with counted(tmp_path, "template", "*.npz"):
+        work(0.2)  # nothing is made
+    assert front_end_seconds(tmp_path) == pytest.approx(0.3, abs=0.11)
