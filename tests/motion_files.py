@@ -9,6 +9,7 @@ from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.open import open_body
 from avatar.io.stance import joint_places
 from avatar.records import Motion
+from avatar.simulate.angles import authored_motion
 
 Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 LEFT_RIGHT = {
@@ -96,3 +97,16 @@ def write_amass(path: Path, motion: Motion, extra: int = 90) -> Path:
     arrays = {"poses": flat, "trans": motion.translations @ Z_FROM_Y.T, "mocap_framerate": np.array(motion.fps)}
     np.savez(path, gender=np.array("female"), labels=np.array([{"marker": 1}], dtype=object), **arrays)
     return path
+
+
+def travelling_walk(seconds: float, ahead: float) -> Motion:
+    """The authored walk at 30 frames a second, with a pelvis that goes ``ahead`` metres, aside and up a little."""
+    motion = authored_motion("walk", fps=30, seconds=seconds)
+    travel = np.linspace(0, 1, len(motion.poses))[:, None] * [0.1, 0.02, ahead]
+    return Motion(motion.poses, travel.astype(np.float32), 30.0, "walk")
+
+
+def assert_same_poses(found: np.ndarray, expected: np.ndarray, degrees: float = 0.01) -> None:
+    """Axis-angles of the same rotations but for an angle."""
+    turned = Rotation.from_rotvec(found.reshape(-1, 3)).inv() * Rotation.from_rotvec(expected.reshape(-1, 3))
+    assert np.degrees(turned.magnitude()).max() < degrees

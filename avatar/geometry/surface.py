@@ -36,8 +36,9 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     check_shape("faces", faces, "F 3")
     count, kept = vertices.shape[-2], RINGS.get(faces)
     if kept is None or kept[0].rows != count:
-        corners = [SparseRows.of_table(faces[:, corner, None], count) for corner in range(3)]
-        around = SparseRows.of_table(faces, count).transpose()
+        ids = faces.long()
+        corners = [SparseRows.of_table(ids[:, corner, None], count) for corner in range(3)]
+        around = SparseRows.of_table(ids, count).transpose()
         kept = (*corners, *(corner.transpose() for corner in corners), around, around.transpose())
         RINGS[faces] = kept
     a, b, c = (gather_sum(vertices, kept[corner], kept[3 + corner]) for corner in range(3))

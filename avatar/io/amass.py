@@ -90,8 +90,8 @@ def _frames(path: Path, key: str, array: np.ndarray) -> np.ndarray:
 
 def _same_count(path: Path, key: str, array: np.ndarray, other: np.ndarray, name: str) -> None:
     if len(array) != len(other):
-        told = f"expected shape (T, P) with T={len(other)} as {name} has"
-        raise DataError(path, f"{key}: {told}, got {array.shape}.")
+        expected = f"expected shape (T, P) with T={len(other)} as {name} has"
+        raise DataError(path, f"{key}: {expected}, got {array.shape}.")
 
 
 def _whole_poses(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:

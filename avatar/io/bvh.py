@@ -189,8 +189,8 @@ def _fix_bones(path: Path, joints: list[_Joint], values: np.ndarray) -> None:
         joint.channels = [name if name not in MOVES else f"unused {name}" for name in joint.channels]
     if moved:
         most = max(moved, key=moved.get)
-        told = "positions of %d joints below the root move (%s by %.3g units); their rotations alone are used."
-        log.warning(f"%s: {told}", path, len(moved), most, moved[most])
+        message = "positions of %d joints below the root move (%s by %.3g units); their rotations alone are used."
+        log.warning(f"%s: {message}", path, len(moved), most, moved[most])
 
 
 def _pose(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

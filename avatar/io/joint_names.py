@@ -94,7 +94,7 @@ def _named_joints(names: Sequence[str]) -> dict[int, int]:
         if not has & set(LIMB["hip"]) and "leg" in has and has & {"knee", "shin", "calf"}:
             limb["hip"] = ("leg",)
         if has & set(LIMB["shoulder"]):
-            limb["collar"] = (*limb["collar"], "shoulder")  # Mixamo's LeftShoulder carries LeftArm
+            limb["collar"] = (*limb["collar"], "shoulder")  # Mixamo's LeftShoulder is LeftArm's parent
         else:
             limb["shoulder"] = ("shoulder",)  # older skeletons': below LeftCollar, above LeftElbow
         if "ankle" in has:

@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.checks import AvatarError, DataError, check_suffix, plain_name
+from avatar.geometry.units import METRES
 from avatar.io.amass import read_smpl_arrays
 from avatar.io.bvh import BvhMotion, read_bvh
 from avatar.io.joint_names import INDEX, MAP_HINT, map_joints, read_joint_map
 from avatar.io.npz import naming, read_arrays, write_described
 from avatar.io.stance import (
     FRAMES,
-    METRES,
     Y_FROM,
     check_joint_order,
     check_sides,
@@ -244,10 +244,10 @@ def _read_bvh(path: Path, up: str | None, rest: np.ndarray, joints: Path | None)
         motion = retarget(bvh, source, path.stem, rest)
         leg = _leg_length(_rest_places(bvh), source)
     unit = min(METRES, key=lambda name: abs(np.log(METRES[name] * leg / LEG)))
-    told = (
+    message = (
         "%s: %d joints of %d mapped by name, size fitted to the body's legs: one of %.3g here, which is likely in %s."
     )
-    log.info(told, path, len(source), len(bvh.names), leg, unit)
+    log.info(message, path, len(source), len(bvh.names), leg, unit)
     return motion
 
 

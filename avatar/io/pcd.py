@@ -65,7 +65,7 @@ def _header(path: Path, data: bytes) -> tuple[dict[str, list[str]], np.dtype, in
         viewpoint = [float(word) for word in header.get("VIEWPOINT", AT_ORIGIN)]
         if min(counts) < 1 or max(counts) > len(data) or count < 0 or len(viewpoint) != 7:
             raise ValueError("numbers out of range")
-        # several padding fields share the name "_": fields are told apart by their place
+        # several padding fields share the name "_": a field is known by its place
         unique = [name if names.index(name) == i else f"{name} {i}" for i, name in enumerate(names)]
         row = np.dtype([(name, f"<{kind}", (size,)) for name, kind, size in zip(unique, kinds, counts, strict=True)])
     except (KeyError, IndexError, ValueError, TypeError, OverflowError) as error:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.model import SMPL_PARENTS
 from avatar.checks import DataError, unknown_name
+from avatar.geometry.units import METRES
 from avatar.io.joint_names import INDEX
 
 log = logging.getLogger(__name__)
@@ -25,7 +26,6 @@ Y_FROM = {  # rotations that turn a world, upright along an axis, to y up; about
     "-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
 }
 AUTO = "auto"
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 UPRIGHT, ELSEWHERE = 0.5, 0.8  # mean cosine between a person, from ankles to shoulders, and an axis
 FRAMES = 2000  # that are looked at
 FASTEST = 15.0  # m/s of the pelvis, for one frame in twenty
@@ -71,20 +71,20 @@ def settle_up(path: Path, low: np.ndarray, high: np.ndarray, up: str | None, usu
     shares = {axis: float(mean @ turn[1]) for axis, turn in Y_FROM.items()}
     best = max(shares, key=shares.get)
     wanted = usual if up in (None, AUTO) else up
-    told = f"({shares[best]:.2f} of 1 from ankles to shoulders, over the frames)"
+    share = f"({shares[best]:.2f} of 1 from ankles to shoulders, over the frames)"
     if wanted and shares[wanted] >= UPRIGHT:
         return wanted
     if up not in (None, AUTO):
-        log.warning("%s: people do not stand along %s, as up=%s says, but along %s %s.", path, up, up, best, told)
+        log.warning("%s: people do not stand along %s, as up=%s says, but along %s %s.", path, up, up, best, share)
     elif (up == AUTO or usual is None) and shares[best] >= ELSEWHERE:
-        log.warning("%s: people stand along %s %s, which is taken for up.", path, best, told)
+        log.warning("%s: people stand along %s %s, which is taken for up.", path, best, share)
         return best
     elif usual is None or up == AUTO:
         raise DataError(
-            path, f"expected people who stand along an axis, the nearest is {best} {told}.", "Give up=y, z, -y or -z."
+            path, f"expected people who stand along an axis, the nearest is {best} {share}.", "Give up=y, z, -y or -z."
         )
     elif shares[best] > ELSEWHERE:
-        problem = f"expected people upright along {usual}, they are upright along {best} {told}."
+        problem = f"expected people upright along {usual}, they are upright along {best} {share}."
         raise DataError(path, problem, f"Give up={best}, or up={usual} if people really lie down.")
     else:
         log.warning(
@@ -113,8 +113,8 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
     others = {axis: _planted(moved, steps @ turn.T)[1] for axis, turn in Y_FROM.items() if axis != "y"}
     best = max(others, key=others.get)
     if len(steps) >= 10 and others[best] > PLANTED and explained < PLANTED / 2:
-        told = "translations fit the feet (%.2f of 1, as they are %.2f) if they are turned up without the poses"
-        log.warning(f"%s: {told}: correct the file if people fly.", path, others[best], explained)
+        message = "translations fit the feet (%.2f of 1, as they are %.2f) if they are turned up without the poses"
+        log.warning(f"%s: {message}: correct the file if people fly.", path, others[best], explained)
     if units is None and len(steps) >= 10 and explained > PLANTED and 0 < scale < 0.1:
         near = min(METRES, key=lambda name: abs(np.log(METRES[name] / scale)))
         problem = f"expected translations in metres, feet stand still if their unit is {scale:.3g} m, which is {near}."
@@ -127,7 +127,7 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
 
 def _planted(moved: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
     """The factor of the pelvis's ``steps (T, 3)`` that undoes how the standing foot ``moved`` about it, and the share
-    of that movement's square which it undoes; nothing is told by feet that move less than a millimetre.
+    of that movement's square which it undoes; feet that move less than a millimetre say nothing.
     """
     if np.square(moved).sum() < len(moved) * STILL**2:
         return 1.0, 0.0
@@ -147,8 +147,8 @@ def check_sides(path: Path, places: np.ndarray, source: dict[int, int]) -> None:
         lengths = np.linalg.norm(toes, axis=1) * np.linalg.norm(ahead, axis=1)
         cosine = float(np.median((toes * ahead).sum(axis=1) / np.maximum(lengths, 1e-12)))
         if cosine < -UPRIGHT:
-            told = "toes point backwards (%s: %.2f of 1): left and right may be swapped, joints=map.yaml names them."
-            log.warning(f"%s: {told}", path, side, -cosine)
+            message = "toes point backwards (%s: %.2f of 1): left and right may be swapped, joints=map.yaml names them."
+            log.warning(f"%s: {message}", path, side, -cosine)
 
 
 def check_joint_order(path: Path, poses: np.ndarray) -> None:

@@ -30,8 +30,6 @@ from avatar.records import Mesh
 
 MAX_BYTES = 2 << 30
 MAX_VERTICES = 20_000_000
-PERSON = (0.5, 2.5)  # metres: heights of people
-UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 
 
 def read_surface(path: str | Path) -> RawSurface:
@@ -78,21 +76,6 @@ def check_mesh(mesh: Mesh) -> None:
     if mesh.colors is not None:
         check_shape("colors", mesh.colors, "V 3", **dims)
         check_finite("colors", mesh.colors)
-
-
-def possible_units(height: float) -> tuple[str, ...]:
-    """Units in which a person of 0.5 to 2.5 m is so tall, the likelier first; none for other heights.
-
-    From 50 to 98.4 both inches (of an adult) and centimetres (of a child) are possible.
-    """
-    low, high = PERSON
-    found = [unit for unit, metres in UNITS.items() if low <= height * metres <= high]
-    return tuple(sorted(found, key=lambda unit: abs(height * UNITS[unit] - 1.7)))
-
-
-def guess_unit(height: float) -> str | None:
-    """The likeliest unit of a person's height: metres, centimetres, millimetres or inches; None for no person's."""
-    return next(iter(possible_units(height)), None)
 
 
 def _read_plain(path: Path, data: bytes) -> RawSurface:

@@ -82,7 +82,7 @@ class LayeredConfig(ClosetConfig):
 
     code_skip: bool = True  # the decoders see the garment code itself beside its features
     free_offsets: bool = True  # an offset of each vertex, learned beside the code, is added to the template's
-    pose_frame: PoseFrame = PoseFrame.heading  # the skirt of a bending person hangs down
+    pose_frame: PoseFrame = PoseFrame.heading  # axes of what network and handles see: a bent person's skirt hangs down
     handles: int = 600  # places of the garment that a Gaussian process moves with the pose; 0 for none
     head: Head = Head.mesh
     cloth: ClothConfig = field(default_factory=ClothConfig)
@@ -316,7 +316,7 @@ class Layered(PointMethod):
 
     def rebuild(self, settings: Any, template: Template, outfits: int, facts: dict, weights: dict) -> nn.Module:
         handles = None
-        if settings.handles:
+        if "handles.poses" in weights:  # runs trained before there were handles have none
             layout = HandleLayout(*(weights[f"handles.{name}"] for name in ("ids", "shares", "groups")))
             handles = ClothHandles(layout, weights["handles.poses"])
         return LayeredAvatar(template, clothed_template(weights), settings, handles)

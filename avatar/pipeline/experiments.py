@@ -217,9 +217,9 @@ def counted(folder: Path, part: str, made: str) -> Iterator[None]:
         yield
         finished = True
     finally:
-        if newest_file(folder, made) > before or not finished:
-            record = front_end_record(folder)
-            seconds, whole = record.get(part, (0.0, True))
+        record = front_end_record(folder)
+        seconds, whole = record.get(part, (0.0, False))
+        if newest_file(folder, made) > before or not (finished or whole):
             elapsed = round(time.process_time() - started + (0 if whole else seconds), 1)
             write_whole(folder / FRONT_END, json.dumps(record | {part: (elapsed, finished)}).encode())
 

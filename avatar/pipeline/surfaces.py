@@ -88,23 +88,22 @@ def convert_folder(config: MeshConfig, folder: Path, frames: list[str]) -> Meshi
     wanted, source = [ending for ending in config.formats if ending != "ply"], config.run / TEXTURE
     if not wanted:
         return MeshingReport(skipped=tuple(frames))
-    texture = read_texture(source) if (source / TEXTURE_FILES[0]).is_file() else None
+    meshes = [folder / f"{name}.ply" for name in frames]
+    if missing := [path for path in meshes if not path.is_file()]:
+        raise DataError(missing[0], "expected the mesh that predicting writes, there is none.", "Predict again.")
+    texture = read_texture(source) if meshes and (source / TEXTURE_FILES[0]).is_file() else None
+    if texture and not texture.fits(read_mesh(meshes[0])):
+        hint = "Make it again: tools/texture.py."
+        log.warning("%s: the texture is of other faces than %s, and is left out. %s", source, meshes[0], hint)
+        texture = None
     pictured = [file_digest(source / name) for name in TEXTURE_FILES] if texture else None
     ledger, written, skipped = Ledger(folder), [], []
-    for name in tracked(frames, "mesh files", unit="frame"):
-        path = folder / f"{name}.ply"
-        if not path.is_file():
-            raise DataError(path, "expected the mesh that predicting writes, there is none.", "Predict again.")
+    for name, path in tracked(list(zip(frames, meshes)), "mesh files", unit="frame"):
         key = keyed(SOURCE, mesh=file_digest(path), texture=pictured, formats=wanted)
         if ledger.find(f"{name} formats", key):
             skipped.append(name)
             continue
-        found = read_mesh(path)
-        if texture and not texture.fits(found):
-            log.warning("%s: the texture is of other faces, and is left out. Make it again: tools/texture.py.", path)
-            texture = pictured = None
-            key = keyed(SOURCE, mesh=file_digest(path), texture=pictured, formats=wanted)
-        files = []
+        found, files = read_mesh(path), []
         for ending in wanted:
             target = folder / f"{name}.{ending}"
             if texture and target.suffix in TEXTURED:

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from motion_files import MIXAMO, Z_FROM_Y, write_bvh
+from motion_files import MIXAMO, Z_FROM_Y, assert_same_poses, travelling_walk, write_bvh
 from scipy.spatial.transform import Rotation
 
 from avatar.body.model import SMPL_JOINTS
@@ -14,7 +14,6 @@ from avatar.io.bvh import read_bvh
 from avatar.io.joint_names import NEEDED, map_joints
 from avatar.io.motions import read_motion
 from avatar.records import Motion
-from avatar.simulate.angles import authored_motion
 
 SIDES = {"left": ("Left", "L", "l"), "right": ("Right", "R", "r")}
 LIMBS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
@@ -93,14 +92,11 @@ RIGS = {
 
 @pytest.fixture(scope="module")
 def walk():
-    motion = authored_motion("walk", fps=30, seconds=0.7)
-    travel = np.linspace(0, 1, len(motion.poses))[:, None] * [0.1, 0.02, 0.6]
-    return Motion(motion.poses, travel.astype(np.float32), 30.0, "walk")
+    return travelling_walk(0.7, 0.6)
 
 
 def assert_same(read, walk, degrees=0.01):
-    turned = Rotation.from_rotvec(read.poses.reshape(-1, 3)).inv() * Rotation.from_rotvec(walk.poses.reshape(-1, 3))
-    assert np.degrees(turned.magnitude()).max() < degrees
+    assert_same_poses(read.poses, walk.poses, degrees)
     np.testing.assert_allclose(read.translations, walk.translations, atol=1e-4)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from motion_files import MIXAMO, write_bvh
+from motion_files import MIXAMO, assert_same_poses, travelling_walk, write_bvh
 from scipy.spatial.transform import Rotation, Slerp
 
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
@@ -22,14 +22,7 @@ from avatar.simulate.angles import authored_motion
 
 @pytest.fixture(scope="module")
 def walk():
-    motion = authored_motion("walk", fps=30, seconds=1.5)
-    travel = np.linspace(0, 1, len(motion.poses))[:, None] * [0.1, 0.02, 0.8]
-    return Motion(motion.poses, travel.astype(np.float32), 30.0, "walk")
-
-
-def assert_same_poses(a, b, degrees=0.01):
-    turned = Rotation.from_rotvec(a.reshape(-1, 3)).inv() * Rotation.from_rotvec(b.reshape(-1, 3))
-    assert np.degrees(turned.magnitude()).max() < degrees
+    return travelling_walk(1.5, 0.8)
 
 
 @pytest.mark.parametrize("name", ["../../up", "/etc/up", "a b", "..", "", "\0", "x" * 200])

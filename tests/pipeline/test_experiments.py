@@ -264,4 +264,6 @@ def test_a_front_end_that_goes_on_counts_together_and_one_made_anew_counts_once(
     assert front_end_seconds(tmp_path) == pytest.approx(0.3, abs=0.11)
     with counted(tmp_path, "template", "*.npz"):
         work(0.2)  # nothing is made
+    with pytest.raises(KeyboardInterrupt):
+        make(0.2, fail=True)  # nothing either, and the part is there
     assert front_end_seconds(tmp_path) == pytest.approx(0.3, abs=0.11)
