@@ -106,7 +106,13 @@ class PackedOutfit(Outfit):
         return self.body.template if self.body else _template_of_mesh(self.path / "template.obj")
 
     def _read_frame(self, path: Path, split: str, name: str) -> Frame:
-        stored = read_arrays(path, REQUIRED, OPTIONAL)
+        return self.frame_of(read_arrays(path, REQUIRED, OPTIONAL), path, split, name)
+
+    def frame_of(self, stored: dict[str, np.ndarray], path: Path, split: str, name: str) -> Frame:
+        """A frame of a file's arrays, whose keys and shapes are those of `REQUIRED` and `OPTIONAL`.
+
+        Raises `DataError` naming ``path`` for arrays that do not fit the body or each other.
+        """
         if self.body is None:
             stored = {key: value for key, value in stored.items() if key not in ("joint_transforms", "pose")}
         rows = dict.fromkeys(("body_verts", "vtransf"), len(self.template.vertices))

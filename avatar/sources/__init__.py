@@ -1,0 +1,1 @@
+"""Data sets and scans as other programs leave them: their layouts, and their conversion to outfits of this project."""

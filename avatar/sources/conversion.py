@@ -1,0 +1,255 @@
+"""Conversion of foreign data to outfits of this project: packed frames with body, manifest and where they came from."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+
+from avatar.body.packed import write_body
+from avatar.body.registry import canonical_name
+from avatar.checks import AvatarError, DataError, check_name, check_range
+from avatar.data.folders import OUTFIT_FORMAT, SPLITS
+from avatar.data.packed_layout import BODY, BODY_FILES, MEAN, PackedOutfit
+from avatar.data.validation import check_frame
+from avatar.geometry.surface import interpolate, sample_surface
+from avatar.invocation import command_line, option
+from avatar.io.documents import read_json
+from avatar.io.frames import write_manifest
+from avatar.io.ledger import Ledger, digest_of, file_digest, keyed
+from avatar.io.locks import lock_folder
+from avatar.io.meshes import write_mesh
+from avatar.io.npz import write_arrays, write_whole
+from avatar.io.points import color_bytes
+from avatar.io.raw_surface import vertex_normals
+from avatar.progress import tracked
+from avatar.records import Mesh
+from avatar.settings import settings_to_dict
+from avatar.sources.base import PosedScan, Source, SourceConfig, SourceFrame
+from avatar.sources.normals import oriented_normals
+
+SOURCE = ("avatar.sources.conversion",)
+PROVENANCE = "source.json"
+FIT_KEYS = {"pose": "pose", "translation": "translation", "body_verts": "vertices", "vtransf": "vertex_transforms"}
+FIT_KEYS |= {key: key for key in ("joint_transforms", "pose_vertices")}
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class ConvertConfig(SourceConfig):
+    """Conversion of a data set's outfits, or of one folder of scans, to outfits of this project."""
+
+    data_root: Path = Path("data")
+    dataset: str = "mine"  # the folder below data_root that outfits are written to
+    name: str = ""  # of the outfit, where the source has one; that of its folder if empty
+    test: float = (
+        0.2  # share of the frames that become the test split, where the layout has none: the last of each sequence
+    )
+    start: int = 0  # first frame of each sequence
+    stop: int | None = None  # the frame behind the last one; all of them if null
+    step: int = 1  # every which frame is taken
+    points: int | None = None  # a scan, sampled evenly from its mesh; its own vertices and faces if null
+    skip_invalid: bool = False  # leave invalid frames out, named at the end, where conversion would stop otherwise
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_name("dataset", self.dataset)
+        if self.name:
+            check_name("name", self.name)
+        check_range(self, "test", low=0, high=0.9)
+        check_range(self, "start", low=0)
+        check_range(self, "stop", "step", low=1)
+        check_range(self, "points", low=100)
+
+
+def convert_outfit(source: Source, config: ConvertConfig) -> Path:
+    """Writes one outfit's frames below ``<data_root>/<dataset>``, or goes on with it; gives the outfit's folder.
+
+    Frames are checked as they are when they are loaded for training; what is finished is not made again unless its
+    files, the body or the settings have changed. ``source.json`` names every frame's files and their hashes. Raises
+    `DataError` naming the file for an invalid frame (unless these are skipped), scans without a fitted body, and
+    an outfit that another source was converted to.
+    """
+    folder = Path(config.data_root) / config.dataset / (config.name or source.name)
+    frames = chosen_frames(source.frames, config)
+    if not frames:
+        raise DataError(source.path, f"expected frames of {source.name}, start, stop and step leave none.")
+    with lock_folder(folder):
+        _claim(folder, source)
+        write_body_files(folder, source)
+        ledger, target, failed = Ledger(folder), PackedOutfit(folder), {}
+        settings = {key: getattr(config, key) for key in ("units", "up", "points")}
+        body = digest_of([file_digest(path) for path in sorted(folder.glob("*.npz")) + sorted(folder.glob("*.obj"))])
+        for frame in tracked(frames, f"convert {source.name}"):
+            path = folder / frame.split / f"{frame.name}.npz"
+            key = keyed(SOURCE, files=[file_digest(file) for file in frame.files], body=body, settings=settings)
+            label = f"{frame.split}/{frame.name}"
+            if ledger.find(label, key) is not None:
+                continue
+            try:
+                arrays = packed_arrays(source, frame, config)
+                check_frame(
+                    target.frame_of(arrays, frame.files[0], frame.split, frame.name), target.template, frame.files[0]
+                )
+            except AvatarError as error:
+                if not config.skip_invalid:
+                    raise
+                failed[label] = str(error)
+                path.unlink(missing_ok=True)
+                continue
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_arrays(path, arrays)
+            ledger.record(label, key, [path])
+        if len(failed) == len(frames):
+            raise DataError(
+                source.path, f"expected valid frames, all {len(frames)} are invalid. {next(iter(failed.values()))}"
+            )
+        _drop_others(folder, {f"{frame.split}/{frame.name}" for frame in frames} - failed.keys())
+        _write_provenance(folder, source, config, frames, failed)
+        write_manifest(folder)
+    for label, problem in failed.items():
+        log.warning("convert: left out %s: %s", label, problem)
+    return folder
+
+
+def chosen_frames(frames: tuple[SourceFrame, ...], config: ConvertConfig) -> list[SourceFrame]:
+    """The frames that are converted, each with its split: the layout's own, or the last of each sequence for testing.
+
+    Single scans are one sequence, in the order of their names. At least one frame is left to train on.
+    """
+    chosen = []
+    for _, group in groupby(frames, key=lambda frame: (frame.split, frame.sequence)):
+        taken = list(group)[config.start : config.stop : config.step]
+        tested = min(round(config.test * len(taken)), len(taken) - 1)
+        for place, frame in enumerate(taken):
+            split = frame.split or ("test" if place >= len(taken) - tested else "train")
+            chosen.append(replace(frame, split=split))
+    return chosen
+
+
+def packed_arrays(source: Source, frame: SourceFrame, config: ConvertConfig) -> dict[str, np.ndarray]:
+    """A frame as the arrays of a packed npz (docs/data.md). Raises `DataError` for a scan without a fitted body."""
+    posed = source.read(frame)
+    if not posed.fitted:
+        problem = "expected a fitted body, nothing beside the scan says how it lies."
+        hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
+        raise DataError(frame.files[0], problem, hint)
+    arrays = {key: getattr(posed, name) for key, name in FIT_KEYS.items()}
+    arrays |= scan_arrays(posed, posed_vertices(source, posed), config.points, frame.name)
+    arrays["scan_name"] = np.array(frame.name)
+    return {key: value for key, value in arrays.items() if value is not None}
+
+
+def scan_arrays(
+    posed: PosedScan, body: np.ndarray | None, points: int | None, name: str
+) -> dict[str, np.ndarray | None]:
+    """A scan's arrays: as it is, or as ``points`` spread evenly over its mesh or taken from its points.
+
+    Normals that are missing are the mesh's, or estimated from the points and oriented by the posed ``body (V, 3)``.
+    What is drawn follows from the frame's name alone.
+    """
+    scan, labels = posed.scan, posed.labels
+    normals = scan.normals
+    if normals is None:
+        if scan.faces is not None:
+            normals = vertex_normals(scan.vertices, scan.faces)
+        else:
+            normals = oriented_normals(scan.vertices, body)
+    arrays = {"scan_pc": scan.vertices, "scan_n": normals, "scan_labels": labels, "scan_colors": scan.colors}
+    if points is None:
+        arrays["scan_faces"] = scan.faces
+    elif scan.faces is not None:
+        seed = int(digest_of(name)[:15], 16)
+        samples = sample_surface(
+            torch.from_numpy(scan.vertices), torch.from_numpy(scan.faces), points, torch.Generator().manual_seed(seed)
+        )
+        nearest = samples.vertex_ids.gather(1, samples.barycentric.argmax(dim=1, keepdim=True))[:, 0].numpy()
+        for key in ("scan_pc", "scan_n", "scan_colors"):
+            if arrays[key] is not None:
+                arrays[key] = interpolate(torch.from_numpy(np.asarray(arrays[key], np.float32)), samples).numpy()
+        arrays["scan_labels"] = None if labels is None else labels[nearest]
+    elif len(scan.vertices) > points:
+        kept = np.sort(np.random.default_rng(int(digest_of(name)[:15], 16)).permutation(len(scan.vertices))[:points])
+        arrays = {key: None if value is None else value[kept] for key, value in arrays.items()}
+    arrays["scan_n"] = arrays["scan_n"] / np.maximum(np.linalg.norm(arrays["scan_n"], axis=1, keepdims=True), 1e-12)
+    if arrays["scan_colors"] is not None:
+        arrays["scan_colors"] = color_bytes(arrays["scan_colors"])
+    return arrays
+
+
+def posed_vertices(source: Source, posed: PosedScan) -> np.ndarray | None:
+    """The posed body's vertices ``(V, 3)``: stored, or from its pose; None where they follow from transforms alone."""
+    if posed.vertices is not None or source.body is None or posed.pose is None:
+        return posed.vertices
+    pose = torch.zeros(1, len(source.body.parents), 3)
+    count = min(len(posed.pose), pose.shape[1])
+    pose[0, :count] = torch.from_numpy(np.asarray(posed.pose[:count], np.float32))
+    shift = torch.zeros(1, 3) if posed.translation is None else torch.from_numpy(posed.translation[None]).float()
+    with torch.no_grad():
+        return source.body(pose, shift).vertices[0].numpy()
+
+
+def write_body_files(folder: Path, source: Source) -> None:
+    """Writes the body at rest, the mean one and ``outfit.yaml``; `DataError` where the source has no body at all."""
+    settings: dict = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{source.layout}: {source.name}"}
+    if source.body is not None:
+        bodies = {BODY: source.body} | ({} if source.mean_body is source.body else {MEAN: source.mean_body})
+        for key, body in bodies.items():
+            write_body(folder / BODY_FILES[key], body)
+            settings[key] = {"canonical": canonical_name(body)}
+    elif source.mesh_template is not None:
+        template = source.mesh_template
+        mesh = Mesh(template.vertices.numpy(), template.faces.numpy())
+        write_mesh(folder / "template.obj", mesh)
+    else:
+        problem = "expected a body beside the scans or body.path, there is none."
+        hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
+        raise DataError(source.path, problem, hint)
+    write_whole(folder / "outfit.yaml", yaml.safe_dump(settings, sort_keys=False).encode())
+
+
+def _claim(folder: Path, source: Source) -> None:
+    """Refuses a folder that holds another outfit than this source's."""
+    record = folder / PROVENANCE
+    if record.is_file():
+        known = read_json(record).get("source")
+        if known != str(source.path.resolve()):
+            problem = f"expected an outfit converted from {source.path.resolve()}, it is from {known}."
+            raise DataError(folder, problem, "Hint: give this one another name=.")
+    elif any((folder / split).is_dir() for split in SPLITS):
+        raise DataError(
+            folder, "expected a new folder, it holds frames of another origin.", "Hint: give another name=."
+        )
+    write_whole(record, json.dumps({"format": "source/1", "source": str(source.path.resolve())}).encode())
+
+
+def _drop_others(folder: Path, kept: set[str]) -> None:
+    """Removes frames of an earlier conversion with other settings."""
+    for split in SPLITS:
+        for path in (folder / split).glob("*.npz"):
+            if f"{split}/{path.stem}" not in kept:
+                path.unlink()
+
+
+def _write_provenance(
+    folder: Path, source: Source, config: ConvertConfig, frames: list[SourceFrame], failed: dict[str, str]
+) -> None:
+    """Writes ``source.json``: layout, settings, and the files and hashes that each frame was made from."""
+    record = {
+        "format": "source/1",
+        "source": str(source.path.resolve()),
+        "layout": source.layout,
+        "settings": settings_to_dict(config),
+        "body": [str(path) for path in source.body_files],
+        "frames": {
+            f"{frame.split}/{frame.name}": {str(file): file_digest(file) for file in frame.files} for frame in frames
+        },
+        "left_out": failed,
+    }
+    write_whole(folder / PROVENANCE, f"{json.dumps(record, indent=1, default=str)}\n".encode())
