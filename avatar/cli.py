@@ -17,7 +17,7 @@ import os
 import select
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
 from types import FrameType
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from avatar import invocation
 from avatar.declared import declared
-from avatar.verbs import VERBS, Verb, resolve
+from avatar.verbs import GROUPS, VERBS, Verb, resolve, typed_words
 
 if TYPE_CHECKING:
     from avatar.pipeline.parameters import ParametersConfig
@@ -34,30 +34,49 @@ OLDEST = (3, 11)
 
 
 def main() -> NoReturn:
-    """The console command: its first argument is the verb."""
+    """The console command: its first argument is the verb, or the group of a verb that is the second one."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
-    if name in VERBS:
+    if [name] in map(typed_words, VERBS) or name in GROUPS:
         del sys.argv[1]
         run(name)
-    if name in ("-h", "--help"):
-        lines = [f"  {verb:13} {entry.does}" for verb, entry in VERBS.items()]
-        text, stream, code = "\n".join(["usage: avatar VERB [OPTION=VALUE ...]", "", *lines]), sys.stdout, 0
-    else:
-        near = difflib.get_close_matches(name, VERBS, n=1)
+    list_verbs("avatar", [] if name in ("-h", "--help") else [name], VERBS)
+
+
+def list_verbs(program: str, unknown: list[str], verbs: Iterable[str]) -> NoReturn:
+    """Prints the verbs that a program has and leaves; with code 2 and the nearest one after an unknown word."""
+    words = {" ".join(typed_words(verb)): VERBS[verb].does for verb in verbs}
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], words, n=1)
         hint = f"Did you mean {near[0]}? " if near else ""
-        text, stream, code = f"avatar: no verb {name!r}. {hint}There are: {', '.join(VERBS)}.", sys.stderr, 2
+        text, stream, code = f"{program}: no verb {unknown[0]!r}. {hint}There are: {', '.join(words)}.", sys.stderr, 2
+    else:
+        lines = [f"  {word:13} {does}" for word, does in words.items()]
+        text, stream, code = "\n".join([f"usage: {program} VERB [OPTION=VALUE ...]", "", *lines]), sys.stdout, 0
     with contextlib.suppress(BrokenPipeError):
         print(text, file=stream, flush=True)
     silence_closed_streams()
     sys.exit(code)
 
 
+def verb_of_group(group: str) -> str:
+    """The verb of a group that the next argument names; without one the group's verbs are listed, and the end."""
+    verbs = {verb: " ".join(typed_words(verb)[1:]) for verb in VERBS if typed_words(verb)[0] == group}
+    word = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if word not in verbs.values():
+        list_verbs("avatar", [] if word in ("-h", "--help") else [f"{group} {word}"], verbs)
+    del sys.argv[1]
+    return f"{group}_{word}"
+
+
 def run(name: str, verb: Verb | None = None) -> NoReturn:
     """Runs a verb, given where it is not in `VERBS`, with the arguments of the command line; leaves with its exit code.
+
+    The name of a group stands for the verb that the first argument names.
 
     The code is 0, 2 for bad input or a missing package, 75 after a signal, or 141 where the reader of its output has
     left; faults of the program end in a traceback.
     """
+    name = verb_of_group(name) if name in GROUPS else name
     for number in signal.SIGINT, signal.SIGTERM:  # until the verb listens itself
         signal.signal(number, leave_at_once(name))
     gc.disable()  # until `collect_garbage`
@@ -131,7 +150,7 @@ def start(name: str, verb: Verb) -> None:
 
 def refuse(name: str, message: object) -> int:
     """Prints why a verb does not do what it was asked to; gives the exit code for it."""
-    print(f"{name}: {message}", file=sys.stderr)
+    print(f"{' '.join(typed_words(name))}: {message}", file=sys.stderr)
     return 2
 
 

@@ -39,7 +39,7 @@ from avatar.pipeline.outcomes import State
 from avatar.progress import WORK
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.training.signals import Stopped, leave_when_asked, listening
-from avatar.verbs import VERBS, Verb, resolve
+from avatar.verbs import VERBS, Verb, resolve, typed_words
 from avatar.world import current_world, torchrun_world
 
 report = logging.getLogger(__name__)
@@ -153,7 +153,7 @@ def run_job(name: str, verb: Verb, config: DictConfig, journal: Path, parent: in
     listen_to_verbs(logging.INFO)
     job = HydraConfig.get()
     several = job.mode is RunMode.MULTIRUN
-    line = " ".join([name, *OmegaConf.to_container(job.overrides.task, resolve=False)])
+    line = " ".join([*typed_words(name), *OmegaConf.to_container(job.overrides.task, resolve=False)])
 
     def note(state: State, **facts: Any) -> None:
         if several:

@@ -14,6 +14,8 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+from avatar.verbs import typed_words
+
 DISTRIBUTION = "clothed-avatar"  # on a package index; `avatar` belongs to somebody else there
 STOPPED = os.EX_TEMPFAIL  # exit code 75: stopped by a signal, nothing is wrong, the same command goes on
 PIPE_CLOSED = 128 + 13  # as a shell reports a process that SIGPIPE ended: the reader of the output has left
@@ -90,8 +92,9 @@ def shorten(path: Path) -> str:
 def command_line(verb: str, *arguments: str) -> str:
     """The shell command that runs a verb from the current folder with this interpreter."""
     root = checkout()
-    start = [shorten(root / "tools" / f"{verb}.py")] if root else ["-m", "avatar", verb]
-    return shlex.join([interpreter(), *start, *arguments])
+    first, *rest = typed_words(verb)
+    start = [shorten(root / "tools" / f"{first}.py")] if root else ["-m", "avatar", first]
+    return shlex.join([interpreter(), *start, *rest, *arguments])
 
 
 def activation_line() -> str:

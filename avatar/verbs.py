@@ -77,8 +77,23 @@ VERBS = {
     "make_body": Verb("makes a body of any shape", "avatar.cli:make_body"),
     "make_motion": Verb("writes one of the open dataset's motions as a file", "avatar.cli:make_motion"),
     "pack": Verb("writes an outfit as packed frames, as POP's line stores them", "avatar.cli:pack"),
+    "data_info": Verb(
+        "says what a folder of scans or a data set holds", "avatar.pipeline.intake:data_info", "InfoConfig"
+    ),
+    "data_check": Verb(
+        "measures the frames of a data set, an outfit or a folder of scans",
+        "avatar.pipeline.intake:data_check",
+        "CheckConfig",
+    ),
+    "data_convert": Verb(
+        "converts a data set or a folder of scans to outfits",
+        "avatar.pipeline.intake:data_convert",
+        "avatar.sources.conversion:ConvertConfig",
+    ),
     "doctor": Verb("lists what is installed and what is missing", "avatar.cli:doctor"),
 }
+
+GROUPS = ("data",)  # whose verbs are typed as two words: `avatar data check`
 
 OPTIONS = {  # that a verb's help begins with, a dozen at most
     "simulate": "preset outfits shapes root train test train_motions test_motions fps seconds workers seed",
@@ -101,6 +116,9 @@ OPTIONS = {  # that a verb's help begins with, a dozen at most
     "report": "run against split frames data_root",
     "demo": "dataset outfit size train.minutes static_share points meshes data_root runs_root device",
     "parameters": "out",
+    "data_info": "source layout outfits",
+    "data_check": "source layout outfits frames units up body.path body.betas fits out",
+    "data_convert": "source dataset name layout outfits units up body.path body.betas fits test data_root",
 }
 
 SHARED = {  # what options mean in several verbs
@@ -115,6 +133,12 @@ SHARED = {  # what options mean in several verbs
     "seed": "of all that is drawn at random",
     "device": "auto takes CUDA where there is one",
 }
+
+
+def typed_words(verb: str) -> list[str]:
+    """The words by which a verb is called: ``data check`` for one of a group, else its name."""
+    group, _, rest = verb.partition("_")
+    return [group, rest] if group in GROUPS else [verb]
 
 
 def resolve(name: str) -> Any:

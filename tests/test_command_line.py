@@ -25,11 +25,12 @@ from avatar.invocation import DISTRIBUTION, EXTRAS, install_line
 from avatar.pipeline.outcomes import find_ending
 from avatar.pipeline.surfaces import MeshConfig, mesh
 from avatar.progress import Progress
-from avatar.verbs import VERBS
+from avatar.verbs import VERBS, typed_words
 
 ROOT = Path(__file__).parents[1]
 OUTSIDE = {"bench": "benchmarks:BENCH", "check_reliability": "reliability:CHECK_RELIABILITY"}  # not in the package
-TOOLS = sorted(path for path in (ROOT / "tools").glob("*.py") if path.stem in VERBS or path.stem in OUTSIDE)
+CALLED = {typed_words(verb)[0] for verb in VERBS}  # verbs, and groups of verbs
+TOOLS = sorted(path for path in (ROOT / "tools").glob("*.py") if path.stem in CALLED or path.stem in OUTSIDE)
 SHORT = ["dataset=open", "outfit=tiny", "method=static", "train.points=500", "train.scan_points=500", "train.batch=1"]
 SHORT += ["train.mirror=false"]
 
@@ -110,7 +111,13 @@ def test_every_package_of_an_install_line_is_in_the_extra_it_names():
 @pytest.mark.parametrize("tool", [path for path in TOOLS if path.stem != "doctor"], ids=lambda path: path.stem)
 def test_a_python_without_packages_names_the_line_to_run(tool, tmp_path):
     """``-S`` leaves out all that is installed, as the system's own Python has it."""
-    needed = {"convert_body": ["a", "b"], "pack": ["a", "b"], "make_motion": ["walk", "b"], "make_body": ["a"]}
+    needed = {
+        "convert_body": ["a", "b"],
+        "pack": ["a", "b"],
+        "make_motion": ["walk", "b"],
+        "make_body": ["a"],
+        "data": ["check"],
+    }
     line = [sys.executable, "-S", tool, *needed.get(tool.stem, [])]
     done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
@@ -125,10 +132,33 @@ def test_the_doctor_needs_no_package():
 
 
 def test_every_verb_has_its_tool_and_no_tool_does_more():
-    assert {path.stem for path in TOOLS} == VERBS.keys() | OUTSIDE.keys() and not VERBS.keys() & OUTSIDE.keys()
+    assert {path.stem for path in TOOLS} == CALLED | OUTSIDE.keys() and not CALLED & OUTSIDE.keys()
     for tool in TOOLS:
         words = ", ".join(f'"{word}"' for word in (tool.stem, OUTSIDE.get(tool.stem)) if word)
         assert tool.read_text().endswith(f'from start import run\n\nif __name__ == "__main__":\n    run({words})\n')
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["data"], 0, "  data convert  converts a data set"),
+        (["data", "--help"], 0, "  data check  "),
+        (["data", "chek"], 2, "avatar: no verb 'data chek'. Did you mean data check? There are: data info, "),
+        (["data_check"], 2, "avatar: no verb 'data_check'. Did you mean data check?"),
+        (["data", "check", "source=nowhere"], 2, "data check source=nowhere: nowhere: expected a folder of scans"),
+        (["data", "check", "sourc=."], 2, "data check: sourc: no such option. Did you mean 'source'?"),
+    ],
+)
+def test_verbs_of_a_group_are_two_words(words, code, said, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "avatar", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == code and said in done.stdout + done.stderr and "Traceback" not in done.stderr
 
 
 def test_lists_in_printed_commands_are_quoted():

@@ -18,7 +18,7 @@ from avatar.config import CONF
 from avatar.config import compose_settings as load
 from avatar.methods.registry import find_method
 from avatar.settings import settings_from_dict, settings_to_dict
-from avatar.verbs import VERBS, resolve
+from avatar.verbs import VERBS, resolve, typed_words
 from benchmarks import BENCH
 from reliability import CHECK_RELIABILITY
 
@@ -34,8 +34,11 @@ WITH_SETTINGS |= {"bench": BENCH, "check_reliability": CHECK_RELIABILITY}
 def test_every_verb_composes_and_has_its_tool(name):
     verb = WITH_SETTINGS[name]
     assert type(load(name, verb=verb)) is resolve(verb.settings)
-    assert (ROOT / "tools" / f"{name}.py").is_file()
-    assert (verb.conf or CONF / f"{name}.yaml").read_text().startswith(f"# python tools/{name}.py")
+    tool, *rest = typed_words(name)
+    assert (ROOT / "tools" / f"{tool}.py").is_file()
+    assert (
+        (verb.conf or CONF / f"{name}.yaml").read_text().startswith(f"# python tools/{' '.join([f'{tool}.py', *rest])}")
+    )
 
 
 @pytest.mark.parametrize("name", WITH_SETTINGS)

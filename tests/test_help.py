@@ -11,7 +11,7 @@ import pytest
 from avatar.arguments import help_text, known_options, main_option, meanings
 from avatar.config import register
 from avatar.declared import declared
-from avatar.verbs import OPTIONS, SHARED, VERBS
+from avatar.verbs import OPTIONS, SHARED, VERBS, typed_words
 
 ROOT = Path(__file__).parents[1]
 WITH_OPTIONS = list(OPTIONS)
@@ -35,7 +35,7 @@ def children_seconds() -> float:
 @pytest.mark.parametrize("verb", ["--help", *VERBS])
 def test_help_needs_neither_torch_nor_two_seconds(verb):
     before = children_seconds()
-    code, out, err, after = ask(*([verb] if verb == "--help" else [verb, "--help"]))
+    code, out, err, after = ask(*([verb] if verb == "--help" else [*typed_words(verb), "--help"]))
     assert code == 0 and out.startswith("usage: ") and " torch\n" not in err and " scipy\n" not in err
     assert after - before < SECONDS
 

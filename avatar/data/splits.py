@@ -85,3 +85,10 @@ def check_leakage(train: Sequence[str], test: Sequence[str], outfit: str) -> Non
     if shared := sorted(set(train) & set(test)):
         problem = f"expected different frames in train and test, {len(shared)} are in both ({', '.join(shared[:3])})"
         raise AvatarError(f"{outfit}: {problem}. Remove them from one.")
+
+
+def spaced_frames(names: Sequence[str], count: int | None) -> list[str]:
+    """``count`` of the names, evenly spaced; all of them if None or fewer."""
+    if count is None or count >= len(names):
+        return list(names)
+    return [names[round(i * (len(names) - 1) / max(count - 1, 1))] for i in range(count)]

@@ -14,6 +14,7 @@ from avatar.canonical.fields import BodyField
 from avatar.canonical.scans import canonicalize_scan
 from avatar.checks import AvatarError
 from avatar.data.batches import FrameDataset
+from avatar.data.splits import spaced_frames
 from avatar.environment import prepared_process
 from avatar.evaluation.canonical import Canonicalized, canonical_table, check_truth, score_canonicalization
 from avatar.evaluation.scores import Scores, write_scores
@@ -27,7 +28,6 @@ from avatar.io.locks import lock_folder
 from avatar.io.npz import write_whole
 from avatar.methods.canonicalizer import CanonicalizeConfig, SkinningSource, TrainedCanonicalizer, WeightSource
 from avatar.pipeline.scores import current_commit
-from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
 from avatar.records import Frame, Mesh, PointCloud
 from avatar.runs.canonicalizing import canonicalize_frames, scans_digest, skinning_source, train_canonicalizer

@@ -15,8 +15,10 @@ from typing import Any
 from avatar.invocation import activation_line, command_line, interpreter, option, shorten
 from avatar.io.npz import write_whole
 from avatar.progress import WORK, in_words
+from avatar.verbs import typed_words
 
 RESUMED = ("simulate", "canonicalize", "template", "train", "predict", "evaluate", "texture", "mesh", "experiment")
+RESUMED += ("data_convert",)
 SPLITS = ("train", "test", "interpolation", "validation")
 STOP = "stop"  # a file in the folder of a multirun that was asked to stop
 report = logging.getLogger(__name__)
@@ -40,6 +42,9 @@ def find_ending(verb: str, config: Any, result: Any) -> tuple[list[Path], list[s
             root, names = config.root, [name for name, _ in dressed_outfits(config)]
             where = [f"dataset={root.name}", f"outfit={names[0]}", *data_root(root.parent)]
             return [root / name for name in names], [command_line("train", *where)]
+        case "data_convert":
+            where = [f"dataset={config.dataset}", f"outfit={result[0].name}", *data_root(config.data_root)]
+            return result, [command_line("train", *where)]
         case "canonicalize":
             where = [f"dataset={config.dataset}", f"outfit={config.outfit}", f"canonical={config.name}"]
             made = [result / "scans", result / "pictures", *([result / "scores.md"] if config.scored else [])]
@@ -85,12 +90,13 @@ def find_ending(verb: str, config: Any, result: Any) -> tuple[list[Path], list[s
 def report_ending(verb: str, config: Any, result: Any, seconds: float) -> None:
     """Logs how a verb ended: what it made, and the commands that may follow, ready for the shell."""
     made, following = find_ending(verb, config, result)
+    words = " ".join(typed_words(verb))
     if verb in RESUMED and made and not WORK["step"] and not WORK["made"]:
-        report.info("%s: finished already, nothing was left to do.", verb)
+        report.info("%s: finished already, nothing was left to do.", words)
     else:
         counts = {"steps": WORK["step"], "made": WORK["made"], "finished before": WORK["found"]}
         details = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-        report.info("%s: done in %s%s.", verb, in_words(seconds), f" ({details})" if details else "")
+        report.info("%s: done in %s%s.", words, in_words(seconds), f" ({details})" if details else "")
     for path in dict.fromkeys(made):
         report.info("  %s", shorten(path))
     for line in following:

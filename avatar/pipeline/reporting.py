@@ -15,6 +15,7 @@ from avatar.data.folders import SPLITS, VALIDATION
 from avatar.data.layouts import find_outfit
 from avatar.data.outfits import Outfit
 from avatar.data.scanner import ScanConfig
+from avatar.data.splits import spaced_frames
 from avatar.environment import prepared_process
 from avatar.evaluation import aggregate, plots, tables
 from avatar.evaluation.aggregate import FLOORS, method_key
@@ -30,7 +31,6 @@ from avatar.io.npz import write_whole
 from avatar.io.points import read_points
 from avatar.methods.base import TrainedAvatar
 from avatar.pipeline import scores as scored
-from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
 from avatar.records import PointCloud
 from avatar.runs.training import load_avatar
@@ -99,7 +99,7 @@ def report(config: ReportConfig) -> Path:
     splits, root = ("test", *sorted({*SPLITS, VALIDATION} - {"test"})), scored.floors_root(config.run, settings)
     scores = gather_scores((*config.against, config.run), splits, root, against=True)
     for outfit in scored.run_outfits(avatar, config.data_root):
-        names = spaced_frames(list(outfit.frames(config.split)), config.frames)
+        names = spaced_frames(outfit.frames(config.split), config.frames)
         rows += [pose_pictures(config, avatar, outfit, name) for name in names]
         garment = avatar.method.garment(avatar, outfit.name, 50_000)  # at rest, of methods that have one
         if garment is not None:
@@ -358,7 +358,7 @@ def draw_pose_grid(config: CompareConfig, path: Path, runs: Sequence[Path]) -> b
     methods = aggregate.order_methods({method for mine in folders.values() for method in mine})
     rows, labels = [], []
     for name, outfit in outfits.items():
-        names = spaced_frames(list(outfit.frames(split)), config.pictures)
+        names = spaced_frames(outfit.frames(split), config.pictures)
         for frame in tracked(names, f"pictures of {name}", unit="picture"):
             scan = outfit.load(split, frame).scan
             camera = pictures.frame_camera(scan.points, "three_quarter", PICTURE)

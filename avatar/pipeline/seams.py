@@ -14,6 +14,7 @@ from torch import Tensor
 
 from avatar.checks import AvatarError, check_name, check_shape, unknown_name
 from avatar.data.outfits import Outfit
+from avatar.data.splits import spaced_frames
 from avatar.environment import prepared_process
 from avatar.evaluation.aggregate import Interval, bootstrap_mean, grouped, named
 from avatar.evaluation.scores import csv_text
@@ -25,7 +26,6 @@ from avatar.geometry.uv import seam_edges
 from avatar.io.npz import write_whole
 from avatar.methods.base import TrainedAvatar
 from avatar.pipeline.scores import label_of, run_outfits
-from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
 from avatar.records import PointCloud, Scan, SurfaceSamples, Template
 from avatar.runs.training import load_avatar
@@ -172,7 +172,7 @@ def runs_by_outfit(config: SeamsConfig) -> list[list[tuple[TrainedAvatar, Outfit
 
 def probe_seams(config: SeamsConfig, avatar: TrainedAvatar, outfit: Outfit, places: SeamPlaces) -> SeamTest:
     """A run asked at places of an outfit's body, for the frames of a split."""
-    names = spaced_frames(list(outfit.frames(config.split)), config.frames)
+    names = spaced_frames(outfit.frames(config.split), config.frames)
     sums = []
     for name in tracked(names, f"seams of {avatar.config.method.variant} on {outfit.name}"):
         frame = outfit.load(config.split, name)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from avatar.checks import AvatarError, DataError, check_name
+from avatar.data.splits import spaced_frames
 from avatar.environment import prepared_process
 from avatar.export.animation import write_animation, write_usd_meshes, write_usd_points
 from avatar.export.meshing import MeshingReport, PoissonConfig, mesh_folder
@@ -114,13 +115,6 @@ def convert_folder(config: MeshConfig, folder: Path, frames: list[str]) -> Meshi
         ledger.record(f"{name} formats", key, files)
         written.append(name)
     return MeshingReport(tuple(written), tuple(skipped))
-
-
-def spaced_frames(names: list[str], count: int | None) -> list[str]:
-    """``count`` of the names, evenly spaced; all of them if None or fewer."""
-    if count is None or count >= len(names):
-        return names
-    return [names[round(i * (len(names) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
 @prepared_process()

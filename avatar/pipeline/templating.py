@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from avatar.canonical.refinement import pose_mesh
+from avatar.data.splits import spaced_frames
 from avatar.environment import prepared_process
 from avatar.export.pictures import (
     Camera,
@@ -21,7 +22,6 @@ from avatar.export.pictures import (
     save_picture,
 )
 from avatar.io.clothed_templates import read_clothed_template
-from avatar.pipeline.surfaces import spaced_frames
 from avatar.progress import tracked
 from avatar.records import Mesh, PointCloud, Template
 from avatar.runs.templating import TemplateConfig, make_template, skin_colors, template_scans
@@ -62,7 +62,7 @@ def draw_template(config: TemplateConfig, folder: Path) -> list[Path]:
     written = [folder / "pictures" / "template.png", folder / "pictures" / "posed.png"]
     save_picture(written[0], contact_sheet(rows, (), (*VIEWS, "from below", "from below, back", "head")))
     names, scans = template_scans(config.find_run(outfit), outfit)
-    chosen = spaced_frames(list(names), config.pictures)
+    chosen = spaced_frames(names, config.pictures)
     bind, rows = outfit.template.canonical_from_bind, []
     values = torch.from_numpy(clothed.weights)
     for name in tracked(chosen, "pictures", unit="picture"):

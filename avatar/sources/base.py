@@ -33,17 +33,13 @@ class SourceBody:
 class SourceConfig:
     """Which data are read, and what their files do not say."""
 
-    source: Path = Path("scans")  # the data set, or the folder of one outfit's scans
+    source: Path = Path("data/scans")  # the data set, or the folder of one outfit's scans
     layout: str = "auto"  # auto takes the one whose files are there
     outfits: list[str] = field(default_factory=list)  # of a data set with several; all of them if empty
-    units: str = (
-        "auto"  # of scans whose layout does not fix it: m, cm, mm, in; auto takes the unit of a person's height
-    )
+    units: str = "auto"  # of scans, where the layout fixes none: m, cm, mm, in; auto takes that of a person's height
     up: str = "auto"  # the axis that points up, as units: y, z, -y, -z, x, -x; auto takes the one people stand along
     body: SourceBody = field(default_factory=SourceBody)
-    fits: Path | None = (
-        None  # body parameters or body meshes, one a scan or one for all; those beside the scans if null
-    )
+    fits: Path | None = None  # body parameters or meshes, one a scan or one for all; those beside the scans if null
 
     def __post_init__(self):
         if self.units not in ("auto", *METRES):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
@@ -12,12 +13,12 @@ import numpy as np
 import torch
 import yaml
 
+from avatar.body.model import BodyModel
 from avatar.body.packed import write_body
 from avatar.body.registry import canonical_name
 from avatar.checks import AvatarError, DataError, check_name, check_range
 from avatar.data.folders import OUTFIT_FORMAT, SPLITS
 from avatar.data.packed_layout import BODY, BODY_FILES, MEAN, PackedOutfit
-from avatar.data.validation import check_frame
 from avatar.geometry.surface import interpolate, sample_surface
 from avatar.invocation import command_line, option
 from avatar.io.documents import read_json
@@ -29,7 +30,7 @@ from avatar.io.npz import write_arrays, write_whole
 from avatar.io.points import color_bytes
 from avatar.io.raw_surface import vertex_normals
 from avatar.progress import tracked
-from avatar.records import Mesh
+from avatar.records import Frame, Mesh, Template
 from avatar.settings import settings_to_dict
 from avatar.sources.base import PosedScan, Source, SourceConfig, SourceFrame
 from avatar.sources.normals import oriented_normals
@@ -48,9 +49,7 @@ class ConvertConfig(SourceConfig):
     data_root: Path = Path("data")
     dataset: str = "mine"  # the folder below data_root that outfits are written to
     name: str = ""  # of the outfit, where the source has one; that of its folder if empty
-    test: float = (
-        0.2  # share of the frames that become the test split, where the layout has none: the last of each sequence
-    )
+    test: float = 0.2  # share of frames that become the test split where there is none, the last of each sequence
     start: int = 0  # first frame of each sequence
     stop: int | None = None  # the frame behind the last one; all of them if null
     step: int = 1  # every which frame is taken
@@ -77,45 +76,83 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
     an outfit that another source was converted to.
     """
     folder = Path(config.data_root) / config.dataset / (config.name or source.name)
-    frames = chosen_frames(source.frames, config)
-    if not frames:
-        raise DataError(source.path, f"expected frames of {source.name}, start, stop and step leave none.")
-    with lock_folder(folder):
+    outfit = SourceOutfit(source, config)
+    with lock_folder(folder.parent / ".locks" / folder.name):
         _claim(folder, source)
         write_body_files(folder, source)
-        ledger, target, failed = Ledger(folder), PackedOutfit(folder), {}
+        ledger, failed = Ledger(folder), {}
         settings = {key: getattr(config, key) for key in ("units", "up", "points")}
-        body = digest_of([file_digest(path) for path in sorted(folder.glob("*.npz")) + sorted(folder.glob("*.obj"))])
-        for frame in tracked(frames, f"convert {source.name}"):
-            path = folder / frame.split / f"{frame.name}.npz"
-            key = keyed(SOURCE, files=[file_digest(file) for file in frame.files], body=body, settings=settings)
-            label = f"{frame.split}/{frame.name}"
+        bodies = {path.name: file_digest(path) for path in (*folder.glob("*.npz"), *folder.glob("*.obj"))}
+        for frame in tracked(outfit.chosen, f"convert {source.name}"):
+            path, label = folder / frame.split / f"{frame.name}.npz", f"{frame.split}/{frame.name}"
+            files = [file_digest(file) for file in frame.files]
+            key = keyed(SOURCE, files=files, bodies=bodies, settings=settings)
             if ledger.find(label, key) is not None:
                 continue
             try:
-                arrays = packed_arrays(source, frame, config)
-                check_frame(
-                    target.frame_of(arrays, frame.files[0], frame.split, frame.name), target.template, frame.files[0]
-                )
+                outfit.load(frame.split, frame.name)
             except AvatarError as error:
                 if not config.skip_invalid:
                     raise
                 failed[label] = str(error)
-                path.unlink(missing_ok=True)
                 continue
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_arrays(path, arrays)
+            write_arrays(path, outfit.arrays)
             ledger.record(label, key, [path])
-        if len(failed) == len(frames):
-            raise DataError(
-                source.path, f"expected valid frames, all {len(frames)} are invalid. {next(iter(failed.values()))}"
-            )
-        _drop_others(folder, {f"{frame.split}/{frame.name}" for frame in frames} - failed.keys())
-        _write_provenance(folder, source, config, frames, failed)
+        if len(failed) == len(outfit.chosen):
+            problem = f"expected valid frames, all {len(failed)} are invalid. The first: {next(iter(failed.values()))}"
+            raise DataError(source.path, problem)
+        _drop_others(folder, {f"{frame.split}/{frame.name}" for frame in outfit.chosen} - failed.keys())
+        _write_provenance(folder, source, config, outfit.chosen, failed)
         write_manifest(folder)
     for label, problem in failed.items():
         log.warning("convert: left out %s: %s", label, problem)
     return folder
+
+
+class SourceOutfit(PackedOutfit):
+    """A source as an outfit whose frames are loaded and checked without being converted to files.
+
+    ``chosen`` are its frames with their splits; ``arrays`` those of the frame that was loaded last, as a packed file
+    holds them.
+    """
+
+    def __init__(self, source: Source, config: ConvertConfig):
+        super().__init__(source.path, config.dataset)
+        self.name, self.source, self.points = config.name or source.name, source, config.points
+        self.chosen = chosen_frames(source.frames, config)
+        if not self.chosen:
+            raise DataError(source.path, f"expected frames of {source.name}, start, stop and step leave none.")
+        self.arrays: dict[str, np.ndarray] = {}
+
+    @property
+    def body(self) -> BodyModel | None:
+        return self.source.body
+
+    @property
+    def mean_body(self) -> BodyModel | None:
+        return self.source.mean_body
+
+    @cached_property
+    def _listed(self) -> dict[str, tuple[str, ...]]:
+        return {split: tuple(sorted(f.name for f in self.chosen if f.split == split)) for split in SPLITS}
+
+    @cached_property
+    def _by_name(self) -> dict[tuple[str, str], SourceFrame]:
+        return {(frame.split, frame.name): frame for frame in self.chosen}
+
+    def frame_path(self, split: str, name: str) -> Path:
+        super().frame_path(split, name)
+        return self._by_name[split, name].files[0]
+
+    def _read_template(self) -> Template:
+        if self.source.body is None and self.source.mesh_template is not None:
+            return self.source.mesh_template
+        return self.posable_body().template
+
+    def _read_frame(self, path: Path, split: str, name: str) -> Frame:
+        self.arrays = packed_arrays(self.source, self._by_name[split, name], self.points)
+        return self.frame_of(dict(self.arrays), path, split, name)
 
 
 def chosen_frames(frames: tuple[SourceFrame, ...], config: ConvertConfig) -> list[SourceFrame]:
@@ -133,7 +170,7 @@ def chosen_frames(frames: tuple[SourceFrame, ...], config: ConvertConfig) -> lis
     return chosen
 
 
-def packed_arrays(source: Source, frame: SourceFrame, config: ConvertConfig) -> dict[str, np.ndarray]:
+def packed_arrays(source: Source, frame: SourceFrame, points: int | None) -> dict[str, np.ndarray]:
     """A frame as the arrays of a packed npz (docs/data.md). Raises `DataError` for a scan without a fitted body."""
     posed = source.read(frame)
     if not posed.fitted:
@@ -141,7 +178,7 @@ def packed_arrays(source: Source, frame: SourceFrame, config: ConvertConfig) -> 
         hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
         raise DataError(frame.files[0], problem, hint)
     arrays = {key: getattr(posed, name) for key, name in FIT_KEYS.items()}
-    arrays |= scan_arrays(posed, posed_vertices(source, posed), config.points, frame.name)
+    arrays |= scan_arrays(posed, posed_vertices(source, posed), points, frame.name)
     arrays["scan_name"] = np.array(frame.name)
     return {key: value for key, value in arrays.items() if value is not None}
 

@@ -1,0 +1,125 @@
+"""`data info`, `data check` and `data convert`: what other people's data hold, measured, and made outfits of ours."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from avatar.checks import AvatarError, check_range
+from avatar.data.folders import SPLITS
+from avatar.data.layouts import open_outfit_folder
+from avatar.data.outfits import Outfit
+from avatar.environment import prepared_process
+from avatar.io.npz import write_whole
+from avatar.sources.base import Source, SourceConfig
+from avatar.sources.conversion import ConvertConfig, SourceOutfit, convert_outfit
+from avatar.sources.findings import Findings, FrameFinding, describe, measure_outfit
+from avatar.sources.registry import open_sources
+
+
+@dataclass
+class InfoConfig(SourceConfig):
+    """What a data set or a folder of scans holds, from its files' names and one frame."""
+
+
+@dataclass
+class CheckConfig(SourceConfig):
+    """Measures of the frames of a data set, of a folder of scans, or of outfits of this project."""
+
+    frames: int | None = 20  # of each split, evenly spaced; all of them if null
+    out: Path | None = None  # a CSV file with a row a frame
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_range(self, "frames", low=1)
+
+
+@prepared_process()
+def data_info(config: InfoConfig) -> list[Path]:
+    """Prints one screen on the outfits of a source: layout, splits, sequences, the first frame and the body.
+
+    Raises `DataError` for a folder of no known layout, or whose first frame cannot be read.
+    """
+    for outfit in opened_outfits(config):
+        print("\n  ".join([f"{outfit.name}:", *_facts(outfit)]))
+    return []
+
+
+@prepared_process()
+def data_check(config: CheckConfig) -> list[Path]:
+    """Prints what the frames of each outfit of a source measure, and what is doubtful about them.
+
+    Raises `AvatarError` at the end where frames are invalid, with their number and the first one's reason.
+    """
+    found = {outfit.name: measure_outfit(outfit, config.frames) for outfit in opened_outfits(config)}
+    for name, findings in found.items():
+        print("\n  ".join([f"{name}:", *describe(findings)]))
+    if config.out is not None:
+        write_findings(config.out, found)
+    invalid = [(name, frame) for name, findings in found.items() for frame in findings.invalid]
+    if invalid:
+        name, frame = invalid[0]
+        total = sum(len(findings.frames) for findings in found.values())
+        raise AvatarError(f"{len(invalid)} of {total} frames are invalid. The first, of {name}: {frame.problem}")
+    return [config.out] if config.out else []
+
+
+@prepared_process()
+def data_convert(config: ConvertConfig) -> list[Path]:
+    """Converts every outfit of a source (`convert_outfit`); gives their folders.
+
+    Raises `AvatarError` where one ``name`` is given for several outfits.
+    """
+    sources = open_sources(config)
+    if config.name and len(sources) > 1:
+        listed = ", ".join(source.name for source in sources)
+        raise AvatarError(f"name: expected none for several outfits, got {config.name!r} for {listed}.")
+    return [convert_outfit(source, config) for source in sources]
+
+
+def opened_outfits(config: SourceConfig) -> list[Outfit]:
+    """The outfits of a source, or of a folder of this project's own data."""
+    path = Path(config.source)
+    if (path / "outfit.yaml").is_file():
+        return [open_outfit_folder(path)]
+    own = [folder for folder in sorted(path.glob("*/")) if (folder / "outfit.yaml").is_file()]
+    if own and config.layout == "auto":
+        return [open_outfit_folder(folder) for folder in own if not config.outfits or folder.name in config.outfits]
+    options = ConvertConfig(**{entry.name: getattr(config, entry.name) for entry in fields(SourceConfig)})
+    return [SourceOutfit(source, options) for source in open_sources(config)]
+
+
+def _facts(outfit: Outfit) -> list[str]:
+    """Lines on an outfit, from the names of its files and its first frame."""
+    source: Source | None = getattr(outfit, "source", None)
+    sizes = {split: outfit.frames(split) for split in SPLITS if outfit.has_frames(split)}
+    lines = [f"layout: {source.layout if source else 'this project'}, in {outfit.path}"]
+    if source:
+        sequences = {frame.sequence for frame in source.frames} - {""}
+        given = "as the layout has them" if any(frame.split for frame in source.frames) else "by test=, the last frames"
+        lines.append(f"sequences: {len(sequences) or 'single scans'}; splits {given}")
+    lines.append("frames: " + ", ".join(f"{len(names)} {split}" for split, names in sizes.items()))
+    split, names = next(iter(sizes.items()))
+    frame, body = outfit.load(split, names[0]), outfit.body
+    scan = frame.scan
+    kind = f"{len(scan.points):,} points" if scan.faces is None else f"mesh of {len(scan.faces):,} faces"
+    lines.append(f"first scan, {names[0]}: {kind}{', coloured' if scan.colors is not None else ''}")
+    vertices = len(outfit.template.vertices)
+    height = float(outfit.template.vertices[:, 1].max() - outfit.template.vertices[:, 1].min())
+    posable = f"{len(body.parents)} joints" if body else "a mesh alone, which motions cannot pose"
+    return [*lines, f"body: {vertices:,} vertices, {height:.2f} m tall, {posable}"]
+
+
+def write_findings(path: Path, found: dict[str, Findings]) -> None:
+    """Writes measures as CSV, a row a frame: its outfit, then the fields of `FrameFinding`."""
+    names, text = [entry.name for entry in fields(FrameFinding)], io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["outfit", *names])
+    for outfit, findings in found.items():
+        for frame in findings.frames:
+            values = [getattr(frame, name) for name in names]
+            rows.writerow([outfit, *(" ".join(v) if isinstance(v, tuple) else v for v in values)])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, text.getvalue().encode())
