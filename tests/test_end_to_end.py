@@ -127,7 +127,7 @@ def test_a_motion_becomes_points_meshes_and_animation_files(job, tmp_path):
     assert len(frames) >= 3
     mesh(MeshConfig(run=config.folder, predictions=folder.parent.name, formats=("ply",), frames=2))
     made = export(ExportConfig(run=config.folder, predictions=folder.parent.name, motion=motion))
-    assert {path.name for path in made} == {"points.usdc", "meshes.usdc", "preview.webp", "body.glb"}
+    assert {path.name for path in made} == {"points.usdc", "meshes.usdc", "preview.webp", "frames.png", "body.glb"}
     assert all(path.stat().st_size > 1000 for path in made)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from avatar.checks import AvatarError
 from avatar.data.folders import SPLITS
 from avatar.data.outfits import Outfit
 
+Name = TypeVar("Name")
 SEVERAL_SEQUENCES = 4  # from here on whole sequences are held back, below it frames
 
 
@@ -87,8 +89,8 @@ def check_leakage(train: Sequence[str], test: Sequence[str], outfit: str) -> Non
         raise AvatarError(f"{outfit}: {problem}. Remove them from one.")
 
 
-def spaced_frames(names: Sequence[str], count: int | None) -> list[str]:
-    """``count`` of the names, evenly spaced; all of them if None or fewer."""
+def spaced_frames(names: Sequence[Name], count: int | None) -> list[Name]:
+    """``count`` of the frames' names, evenly spaced; all of them if None or fewer."""
     if count is None or count >= len(names):
         return list(names)
     return [names[round(i * (len(names) - 1) / max(count - 1, 1))] for i in range(count)]

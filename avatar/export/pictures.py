@@ -218,6 +218,16 @@ def map_colors(values: np.ndarray) -> np.ndarray:
     return require("matplotlib").colormaps["turbo"](np.clip(values, 0, 1))[..., :3]
 
 
+def cropped(pictures: Sequence[np.ndarray], margin: int = 8) -> list[np.ndarray]:
+    """Pictures ``(H, W, 3)`` of one size without the border that is background in all of them, but for a margin."""
+    drawn = np.any([(picture != np.array(PAPER, np.uint8)).any(axis=2) for picture in pictures], axis=0)
+    rows, columns = (np.flatnonzero(drawn.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return list(pictures)
+    top, bottom, left, right = rows[0] - margin, rows[-1] + margin, columns[0] - margin, columns[-1] + margin
+    return [picture[max(top, 0) : bottom + 1, max(left, 0) : right + 1] for picture in pictures]
+
+
 def contact_sheet(
     rows: Sequence[Sequence[np.ndarray]],
     row_labels: Sequence[str] = (),

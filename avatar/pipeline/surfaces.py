@@ -12,7 +12,7 @@ from avatar.data.splits import spaced_frames
 from avatar.environment import prepared_process
 from avatar.export.animation import write_animation, write_usd_meshes, write_usd_points
 from avatar.export.meshing import MeshingReport, PoissonConfig, mesh_folder
-from avatar.export.pictures import frame_camera, render_points
+from avatar.export.pictures import contact_sheet, cropped, frame_camera, render_points, save_picture
 from avatar.export.rigged import write_rigged_glb
 from avatar.io.ledger import Ledger, file_digest, keyed
 from avatar.io.meshes import read_mesh, write_mesh
@@ -28,6 +28,8 @@ from avatar.runs.training import load_avatar
 
 SOURCE = ("avatar.io.meshes", "avatar.io.textures")  # what writes meshes
 log = logging.getLogger(__name__)
+
+SHOWN = 8  # frames of a sequence side by side
 
 
 @dataclass
@@ -119,9 +121,10 @@ def convert_folder(config: MeshConfig, folder: Path, frames: list[str]) -> Meshi
 
 @prepared_process()
 def export(config: ExportConfig) -> list[Path]:
-    """Writes ``<run>/export/<motion>/<outfit>/{points.usdc, meshes.usdc, body.glb, preview.webp}``. Meshes are there
-    when the sequence was meshed, joint tracks when its motion file is given. Frames are shown at the times of their
-    numbers. Several sequences (those of a split) have a folder each, ``<outfit>/<sequence>``.
+    """Writes ``<run>/export/<motion>/<outfit>/{points.usdc, meshes.usdc, body.glb, preview.webp, frames.png}``.
+    Meshes are there when the sequence was meshed, joint tracks when its motion file is given. Frames are shown at the
+    times of their numbers, eight of them side by side in ``frames.png``. Several sequences (those of a split) have a
+    folder each, ``<outfit>/<sequence>``.
     """
     avatar, written, jobs = load_avatar(config.run), [], []
     for outfit in run_outfits(avatar, config.data_root):
@@ -174,9 +177,10 @@ def export_sequence(folder: Path, meshes: Path, frames: dict[int, str], fps: flo
     camera = frame_camera(read_points(clouds[min(clouds)]).points, "three_quarter", margin=0.2)
     images = [render_points(read_points(path), camera) for path in clouds.values()]
     write_animation(target / "preview.webp", images, fps, list(clouds))
+    save_picture(target / "frames.png", contact_sheet([cropped(spaced_frames(images, SHOWN))]))
     surfaces = {number: meshes / f"{name}.ply" for number, name in frames.items()}
     surfaces = {number: path for number, path in surfaces.items() if path.is_file()}
-    made = ["points.usdc", "preview.webp"]
+    made = ["points.usdc", "preview.webp", "frames.png"]
     if surfaces:
         write_usd_meshes(target / "meshes.usdc", map(read_mesh, surfaces.values()), fps, list(surfaces))
         made.append("meshes.usdc")

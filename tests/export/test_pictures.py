@@ -15,6 +15,7 @@ from avatar.export.pictures import (
     Camera,
     color_bar,
     contact_sheet,
+    cropped,
     frame_camera,
     map_colors,
     render_error,
@@ -199,3 +200,13 @@ def test_what_torch_loads_late_may_come_after_a_picture():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stdout) == (0, "drawn\n"), done.stderr
+
+
+def test_pictures_are_cropped_to_what_any_of_them_shows():
+    pictures = [np.full((40, 60, 3), PAPER, np.uint8) for _ in range(2)]
+    pictures[0][10:12, 20:22] = 0
+    pictures[1][30, 40] = 0
+    found = cropped(pictures, margin=3)
+    assert [picture.shape for picture in found] == [(27, 27, 3)] * 2 and (found[0][3, 3] == 0).all()
+    blank = [np.full((4, 5, 3), PAPER, np.uint8)]
+    assert cropped(blank)[0].shape == (4, 5, 3)

@@ -64,7 +64,9 @@ def test_frames_of_a_split_are_exported_by_sequence_at_the_times_of_their_number
         write_points(folder / f"{name}.ply", PointCloud(cloud.points + np.float32([place, 0, 0]), cloud.normals))
     made = export(ExportConfig(run=run, predictions="chosen", fps=24))
     target = run / "export" / "chosen" / source.name
-    names = {f"{sequence}/{file}" for sequence in ("walk", "squat") for file in ("points.usdc", "preview.webp")}
+    names = {
+        f"{sequence}/{file}" for sequence in ("walk", "squat") for file in ("points.usdc", "preview.webp", "frames.png")
+    }
     assert {str(path.relative_to(target)) for path in made} == names | {"body.glb"}
     assert times(target / "walk" / "points.usdc", "points") == (24, 9, 20, [9, 10, 19, 20])
     stage = Usd.Stage.Open(str(target / "walk" / "points.usdc"))
