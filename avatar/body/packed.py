@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,7 +16,7 @@ from avatar.body.skinning import blend_transforms, check_parents
 from avatar.checks import AvatarError, DataError, check_shape
 from avatar.geometry.transforms import invert_affine, invert_rigid, transform_points
 from avatar.io.meshes import read_obj_atlas
-from avatar.io.npz import read_arrays, write_arrays
+from avatar.io.npz import npz_keys, read_arrays, write_arrays
 from avatar.records import Template
 
 REQUIRED_KEYS = {"vertices": "float V 3", "faces": "int F 3", "parents": "int J", "joint_names": "text J"}
@@ -163,11 +162,7 @@ def data_errors(path: Path, hint: str = "") -> Iterator[None]:
 
 def holds_template(path: Path) -> bool:
     """Whether a file looks like a ``template.npz``, valid or not."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {"vertices.npy", "parents.npy"} <= set(archive.namelist())
-    except (zipfile.BadZipFile, OSError):
-        return False
+    return {"vertices", "parents"} <= npz_keys(path)
 
 
 def add_atlas(source: Path, target: Path, uv: Path) -> None:

@@ -65,20 +65,24 @@ def smpl_body(
     all_joints: bool = False,
     canonical_pose: Tensor | None = None,
     kind: str | None = None,
+    vertices: np.ndarray | None = None,
 ) -> BodyModel:
     """A body of the SMPL family from a file of tools/convert_body.py, float32, with pose blendshapes where it has them.
 
     Shape coefficients ``betas`` are standard deviations, at most as many as the file has. Without ``all_joints`` the
     skinning weights of hands and face go to wrists and head: exactly the model with fingers and face in their zero
-    pose. ``kind`` is what the file must hold (smpl, smplh, smplx), any if None. Raises `DataError` for a missing or
-    damaged file or one of another kind, with the way to a good one; `AvatarError` for too many betas.
+    pose. ``kind`` is what the file must hold (smpl, smplh, smplx), any if None. ``vertices (V, 3)``, metres, are this
+    person's own body in the T-pose, in place of the shape of ``betas``: its joints follow from the file's regressor.
+    Raises `DataError` for a missing or damaged file or one of another kind, with the way to a good one; `AvatarError`
+    for too many betas or another number of vertices.
     """
     model = _read_model(path, kind)
     components = model["shapedirs"].shape[-1]
     if len(betas) > components:
         raise AvatarError(f"betas: expected at most {components} numbers for {path}, got {len(betas)}.")
-    shape = model["shapedirs"][..., : len(betas)] @ np.asarray(betas, np.float64)
-    vertices = model["v_template"] + shape
+    if vertices is None:
+        vertices = model["v_template"] + model["shapedirs"][..., : len(betas)] @ np.asarray(betas, np.float64)
+    check_shape("vertices", vertices, "V 3", V=len(model["v_template"]))
     joints, weights, posedirs = model["J_regressor"] @ vertices, model["weights"], model.get("posedirs")
     parents, names = model["parents"], model["joint_names"]
     if not all_joints:

@@ -24,12 +24,11 @@ from avatar.io.documents import read_json
 from avatar.io.frames import write_manifest
 from avatar.io.ledger import Ledger, digest_of, file_digest, keyed
 from avatar.io.locks import lock_folder
-from avatar.io.meshes import write_mesh
+from avatar.io.meshes import read_mesh, write_mesh
 from avatar.io.npz import write_arrays, write_whole
 from avatar.io.points import color_bytes
 from avatar.io.raw_surface import vertex_normals
 from avatar.progress import tracked
-from avatar.records import Mesh
 from avatar.settings import settings_to_dict
 from avatar.sources.base import PosedScan, Source, SourceConfig, SourceFrame
 from avatar.sources.normals import oriented_normals
@@ -88,7 +87,7 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
         body = digest_of([file_digest(path) for path in sorted(folder.glob("*.npz")) + sorted(folder.glob("*.obj"))])
         for frame in tracked(frames, f"convert {source.name}"):
             path = folder / frame.split / f"{frame.name}.npz"
-            key = keyed(SOURCE, files=[file_digest(file) for file in frame.files], body=body, settings=settings)
+            key = keyed((*SOURCE, type(source).__module__), files=[file_digest(file) for file in frame.files], body=body, settings=settings)
             label = f"{frame.split}/{frame.name}"
             if ledger.find(label, key) is not None:
                 continue
@@ -203,10 +202,12 @@ def write_body_files(folder: Path, source: Source) -> None:
         for key, body in bodies.items():
             write_body(folder / BODY_FILES[key], body)
             settings[key] = {"canonical": canonical_name(body)}
-    elif source.mesh_template is not None:
-        template = source.mesh_template
-        mesh = Mesh(template.vertices.numpy(), template.faces.numpy())
-        write_mesh(folder / "template.obj", mesh)
+    elif source.rest_mesh is not None:
+        mesh = read_mesh(source.rest_mesh)
+        if source.rest_mesh.suffix == ".obj":
+            write_whole(folder / "template.obj", source.rest_mesh.read_bytes())  # with its UV atlas
+        else:
+            write_mesh(folder / "template.obj", mesh)
     else:
         problem = "expected a body beside the scans or body.path, there is none."
         hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
