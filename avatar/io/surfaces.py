@@ -50,7 +50,7 @@ def read_surface(path: str | Path) -> RawSurface:
 
 
 def check_surface(surface: RawSurface) -> RawSurface:
-    """The surface with vertices float32 and unit normals; raises `DataError` for invalid ones as `read_surface` does."""
+    """The surface with float32 vertices and unit normals. Raises `DataError` for an invalid one as `read_surface`."""
     path = surface.path
     with np.errstate(all="ignore"):
         surface = replace(surface, vertices=np.asarray(surface.vertices).astype(np.float32))

@@ -29,20 +29,17 @@ class CapeRawSource(FittedSource):
     layout = "cape_raw"
     home = "https://cape.is.tue.mpg.de, after registration"
     expected = (
-        "  sequences/<subject>/<clothes>_<motion>/<clothes>_<motion>.<frame>.npz   v_posed (6890, 3), pose (72), transl (3)\n"
-        "  minimal_body_shape/<subject>/<subject>_minimal.npy                      or .ply\n"
-        "  raw_scans/<subject>/<clothes>_<motion>/<the same names>.ply             optional, millimetres"
+        "  sequences/<subject>/<sequence>/<sequence>.<frame>.npz   v_posed (6890, 3), pose (72), transl (3)\n"
+        "  minimal_body_shape/<subject>/<subject>_minimal.npy      or .ply\n"
+        "  raw_scans/<subject>/<sequence>/<sequence>.<frame>.ply   optional, millimetres\n"
+        "  where a sequence is <clothes>_<motion>, such as shortlong_ATUsquat_trial2"
     )
 
     @classmethod
     def find(cls, path: Path) -> dict[str, Path]:
-        found: dict[str, Path] = {}
-        for root in (path, *(path / name for name in SEQUENCES)):
-            for subject in (root, *subfolders(root)):
-                for folder in subfolders(subject):
-                    if (folder / "..").resolve() == subject.resolve() and _holds_cape(folder):
-                        found.setdefault(_outfit_of(subject, folder), subject)
-        return dict(sorted(found.items()))
+        subjects = [path, *subfolders(path), *(folder for name in SEQUENCES for folder in subfolders(path / name))]
+        sequences = [(subject, folder) for subject in subjects for folder in subfolders(subject) if _holds_cape(folder)]
+        return dict(sorted({_outfit_of(*pair): pair[0] for pair in sequences}.items()))
 
     @property
     def _root(self) -> Path:
@@ -72,7 +69,9 @@ class CapeRawSource(FittedSource):
         places = [folder / f"{self._subject}{end}" for folder in folders for end in ("_minimal.npy", "_minimal.ply")]
         found = next((place for place in places if place.is_file()), None)
         if found is None and not self.config.body.betas:
-            raise DataError(places[0], "expected the subject's minimal body, there is none.", "Hint: or give body.betas.")
+            raise DataError(
+                places[0], "expected the subject's minimal body, there is none.", "Hint: or give body.betas."
+            )
         return found
 
     def parameters(self, frame: SourceFrame) -> SmplParameters:

@@ -32,6 +32,7 @@ from avatar.progress import tracked
 from avatar.settings import settings_to_dict
 from avatar.sources.base import PosedScan, Source, SourceConfig, SourceFrame
 from avatar.sources.normals import oriented_normals
+from avatar.sources.published import split_frames
 
 SOURCE = ("avatar.sources.conversion",)
 PROVENANCE = "source.json"
@@ -50,6 +51,7 @@ class ConvertConfig(SourceConfig):
     test: float = (
         0.2  # share of the frames that become the test split, where the layout has none: the last of each sequence
     )
+    split: str = ""  # of a paper, where the layout has none: cape, scanimate or 4d-dress, in place of test
     start: int = 0  # first frame of each sequence
     stop: int | None = None  # the frame behind the last one; all of them if null
     step: int = 1  # every which frame is taken
@@ -76,7 +78,7 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
     an outfit that another source was converted to.
     """
     folder = Path(config.data_root) / config.dataset / (config.name or source.name)
-    frames = chosen_frames(source.frames, config)
+    frames = chosen_frames(source, config)
     if not frames:
         raise DataError(source.path, f"expected frames of {source.name}, start, stop and step leave none.")
     with lock_folder(folder):
@@ -87,7 +89,8 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
         body = digest_of([file_digest(path) for path in sorted(folder.glob("*.npz")) + sorted(folder.glob("*.obj"))])
         for frame in tracked(frames, f"convert {source.name}"):
             path = folder / frame.split / f"{frame.name}.npz"
-            key = keyed((*SOURCE, type(source).__module__), files=[file_digest(file) for file in frame.files], body=body, settings=settings)
+            files = [file_digest(file) for file in frame.files]
+            key = keyed((*SOURCE, type(source).__module__), files=files, body=body, settings=settings)
             label = f"{frame.split}/{frame.name}"
             if ledger.find(label, key) is not None:
                 continue
@@ -117,12 +120,17 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
     return folder
 
 
-def chosen_frames(frames: tuple[SourceFrame, ...], config: ConvertConfig) -> list[SourceFrame]:
+def chosen_frames(source: Source, config: ConvertConfig) -> list[SourceFrame]:
     """The frames that are converted, each with its split: the layout's own, or the last of each sequence for testing.
 
-    Single scans are one sequence, in the order of their names. At least one frame is left to train on.
+    Single scans are one sequence, in the order of their names. At least one frame is left to train on. Raises
+    `AvatarError` as `split_frames` for the split of a paper, and for one where the layout has its own.
     """
-    chosen = []
+    frames, chosen = source.frames, []
+    if config.split:
+        if any(frame.split for frame in frames):
+            raise AvatarError(f"split: expected none, as layout {source.layout} has its own, got {config.split}.")
+        frames = split_frames(frames, source.name, config.split)
     for _, group in groupby(frames, key=lambda frame: (frame.split, frame.sequence)):
         taken = list(group)[config.start : config.stop : config.step]
         tested = min(round(config.test * len(taken)), len(taken) - 1)

@@ -23,11 +23,11 @@ class FiteSource(FittedSource):
     """A subject's frames; the scan is the mesh where the file has one, else the points sampled from it."""
 
     layout = "fite"
-    home = "https://pop.is.tue.mpg.de (ReSynth) and https://cape.is.tue.mpg.de (CAPE); FITE's README says how to pack them"
+    home = "https://github.com/jsnln/fite, whose README says how ReSynth, CAPE or your own scans are packed"
     expected = (
-        "  data_scans/<subject>/{train,test}/<frame>.npz             pose (72), transl (3), scan_v, scan_f, scan_pc, scan_n\n"
-        "  data_templates/<subject>/<subject>_minimal_tpose.ply      minimal body in the T-pose\n"
-        "  data_templates/gender_list.yaml                           <subject>: male, female or neutral"
+        "  data_scans/<subject>/{train,test}/<frame>.npz          pose, transl, scan_v, scan_f, scan_pc, scan_n\n"
+        "  data_templates/<subject>/<subject>_minimal_tpose.ply   minimal body in the T-pose\n"
+        "  data_templates/gender_list.yaml                        <subject>: male, female or neutral"
     )
 
     @classmethod

@@ -40,7 +40,9 @@ class FittedSource(Source):
     def __init__(self, path: Path, name: str, config: SourceConfig):
         super().__init__(path, name, config)
         if config.up not in ("auto", "y"):
-            problem = f"up: expected auto or y, as layout {self.layout} keeps scans in their body's axes, got {config.up}."
+            problem = (
+                f"up: expected auto or y, as layout {self.layout} keeps scans in their body's axes, got {config.up}."
+            )
             raise AvatarError(problem)
 
     @abstractmethod
@@ -83,7 +85,9 @@ class FittedSource(Source):
         """The mean of the fits' shapes; empty where they have none."""
         shapes = [self.parameters(frame).betas for frame in self.frames]
         if len({len(shape) for shape in shapes}) != 1:
-            raise DataError(self.path, "betas: expected equally many in all fits, got others.", "Hint: give body.betas.")
+            raise DataError(
+                self.path, "betas: expected equally many in all fits, got others.", "Hint: give body.betas."
+            )
         mean = np.mean(shapes, axis=0)
         if mean.size and (spread := float(np.abs(shapes - mean).max())) > SPREAD:
             log.warning("%s: shapes differ by up to %.1f from their mean, which is taken.", self.path, spread)
@@ -117,7 +121,9 @@ class FittedSource(Source):
             raise DataError(frame.files[-1], "hands: expected rotations, got principal components.", hint)
         with naming(frame.files[-1]):
             pose = parameters.pose_of(self.body, cut=not self.keeps_hands)
-        unit = self.unit_of(scan) if self.config.units == "auto" else self.config.units
+        unit = self.config.units
+        if unit == "auto":
+            unit = self.unit_of(scan) if parameters.scale == 1 else "m"  # a fitted scale is all there is to the unit
         moved = scan.vertices.astype(np.float64) * (METRES[unit] / parameters.scale)
         vertices = self.vertices(frame) if self.keeps_hands else None
         return PosedScan(

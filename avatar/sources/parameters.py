@@ -64,7 +64,7 @@ class SmplParameters:
             if name in places:
                 pose[places[name]] = turn
             elif np.any(turn) and not cut:
-                hint = "Hint: take the kind of model that was fitted, or body.all_joints=false to lay hands and face at rest."
+                hint = "Hint: take the kind of model that was fitted, or lay hands and face at rest: body.all_joints=false."
                 raise AvatarError(f"pose: expected joints of the body, it turns {name}, which the body lacks. {hint}")
         return pose
 
