@@ -64,7 +64,7 @@ class SmplParameters:
             if name in places:
                 pose[places[name]] = turn
             elif np.any(turn) and not cut:
-                hint = "Hint: take the kind of model that was fitted, or lay hands and face at rest: body.all_joints=false."
+                hint = "Hint: take the kind of model that was fitted, or body.all_joints=false for hands at rest."
                 raise AvatarError(f"pose: expected joints of the body, it turns {name}, which the body lacks. {hint}")
         return pose
 
@@ -107,7 +107,7 @@ def parameters_of(path: Path, found: Mapping[str, np.ndarray]) -> SmplParameters
     pose = np.stack(list(turns.values()))
     if (largest := float(np.linalg.norm(pose, axis=1).max())) > 4 * np.pi:
         raise DataError(path, f"pose: expected radians, got turns of {largest:.0f}.", "Hint: convert degrees first.")
-    scale = float(found["scale"][0]) if "scale" in found else 1.0
+    scale = float(found.get("scale", np.ones(1))[0])
     if not scale > 0:
         raise DataError(path, f"scale: expected a number above 0, got {scale}.")
     inner, outer = (next((found[key] for key in keys if key in found), np.zeros(3)) for keys in (INNER, OUTER))
