@@ -100,8 +100,8 @@ def save(path: Path, **arrays: np.ndarray) -> None:
     np.savez(path, **arrays)
 
 
-SHARES = {"train": (0.0, 0.5, 1.0), "test": (0.25, 0.75)}
-TAKES = {"walk": (0.0, 0.5, 1.0), "soccer": (0.25, 0.75)}  # sequences of layouts without splits
+SHARES = {"train": (0.0, 1.0), "test": (0.5,)}
+TAKES = {"walk": (0.0, 1.0), "soccer": (0.5,)}  # sequences of layouts without splits
 
 
 def write_packed(root: Path, person: Model) -> dict[str, Truth]:

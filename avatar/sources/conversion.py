@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 import yaml
 
+from avatar.body.model import BodyModel
 from avatar.body.packed import write_body
 from avatar.body.registry import canonical_name
 from avatar.checks import AvatarError, DataError, check_name, check_range
@@ -38,6 +40,7 @@ SOURCE = ("avatar.sources.conversion",)
 PROVENANCE = "source.json"
 FIT_KEYS = {"pose": "pose", "translation": "translation", "body_verts": "vertices", "vtransf": "vertex_transforms"}
 FIT_KEYS |= {key: key for key in ("joint_transforms", "pose_vertices")}
+FAST = 1  # level of deflating: a few percent larger than level 9, in a tenth of the time
 log = logging.getLogger(__name__)
 
 
@@ -83,8 +86,9 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
         raise DataError(source.path, f"expected frames of {source.name}, start, stop and step leave none.")
     with lock_folder(folder):
         _claim(folder, source)
-        write_body_files(folder, source)
-        ledger, target, failed = Ledger(folder), PackedOutfit(folder), {}
+        ledger, failed = Ledger(folder), {}
+        write_body_files(folder, source, ledger)
+        target = PackedOutfit(folder)
         settings = {key: getattr(config, key) for key in ("units", "up", "points")}
         body = digest_of([file_digest(path) for path in sorted(folder.glob("*.npz")) + sorted(folder.glob("*.obj"))])
         for frame in tracked(frames, f"convert {source.name}"):
@@ -106,7 +110,7 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
                 path.unlink(missing_ok=True)
                 continue
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_arrays(path, arrays)
+            write_arrays(path, arrays, FAST)
             ledger.record(label, key, [path])
         if len(failed) == len(frames):
             raise DataError(
@@ -202,13 +206,19 @@ def posed_vertices(source: Source, posed: PosedScan) -> np.ndarray | None:
         return source.body(pose, shift).vertices[0].numpy()
 
 
-def write_body_files(folder: Path, source: Source) -> None:
-    """Writes the body at rest, the mean one and ``outfit.yaml``; `DataError` where the source has no body at all."""
+def write_body_files(folder: Path, source: Source, ledger: Ledger) -> None:
+    """Writes the body at rest, the mean one and ``outfit.yaml``; `DataError` where the source has no body at all.
+
+    A body that is there already is not written again: the blendshapes of SMPL-X take a minute to deflate.
+    """
     settings: dict = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{source.layout}: {source.name}"}
     if source.body is not None:
         bodies = {BODY: source.body} | ({} if source.mean_body is source.body else {MEAN: source.mean_body})
         for key, body in bodies.items():
-            write_body(folder / BODY_FILES[key], body)
+            path, digest = folder / BODY_FILES[key], keyed(SOURCE, body=body_digest(body))
+            if ledger.find(key, digest) is None:
+                write_body(path, body)
+                ledger.record(key, digest, [path])
             settings[key] = {"canonical": canonical_name(body)}
     elif source.rest_mesh is not None:
         mesh = read_mesh(source.rest_mesh)
@@ -221,6 +231,14 @@ def write_body_files(folder: Path, source: Source) -> None:
         hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
         raise DataError(source.path, problem, hint)
     write_whole(folder / "outfit.yaml", yaml.safe_dump(settings, sort_keys=False).encode())
+
+
+def body_digest(body: BodyModel) -> str:
+    """One hash over all that a body is made of."""
+    found = hashlib.sha256(repr((body.parents, body.joint_names)).encode())
+    for name, buffer in body.named_buffers():
+        found.update(name.encode() + buffer.numpy().tobytes())
+    return found.hexdigest()
 
 
 def _claim(folder: Path, source: Source) -> None:

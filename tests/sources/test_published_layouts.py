@@ -28,7 +28,7 @@ def converted(request, person, bodies, tmp_path_factory):
     root.mkdir()
     truth = write(root, person)
     before = tree_digest(root)
-    config = ConvertConfig(source=root, body=SourceBody(path=bodies[kind]), data_root=root.parent / "data")
+    config = ConvertConfig(source=root, body=SourceBody(path=bodies[kind]), data_root=root.parent / "data", test=0.5)
     folders = [convert_outfit(source, config) for source in open_sources(config)]
     assert tree_digest(root) == before  # nothing of the originals is touched
     return request.param, root, truth, config, [PackedOutfit(folder) for folder in folders]
@@ -50,7 +50,7 @@ def truth_key(truth, outfit, split, name):
 
 
 def test_the_layout_is_found_by_its_files(converted):
-    layout, root, _, config, outfits = converted
+    layout, _, _, config, outfits = converted
     sources = open_sources(config)
     assert {source.layout for source in sources} == {layout}
     assert [source.name for source in sources] == [outfit.name for outfit in outfits]
