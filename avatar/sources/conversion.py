@@ -209,7 +209,7 @@ def posed_vertices(source: Source, posed: PosedScan) -> np.ndarray | None:
 def write_body_files(folder: Path, source: Source, ledger: Ledger) -> None:
     """Writes the body at rest, the mean one and ``outfit.yaml``; `DataError` where the source has no body at all.
 
-    A body that is there already is not written again: the blendshapes of SMPL-X take a minute to deflate.
+    A body that is there already is not written again: the blendshapes of SMPL-X take seconds to deflate.
     """
     settings: dict = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{source.layout}: {source.name}"}
     if source.body is not None:
@@ -217,7 +217,7 @@ def write_body_files(folder: Path, source: Source, ledger: Ledger) -> None:
         for key, body in bodies.items():
             path, digest = folder / BODY_FILES[key], keyed(SOURCE, body=body_digest(body))
             if ledger.find(key, digest) is None:
-                write_body(path, body)
+                write_body(path, body, FAST)
                 ledger.record(key, digest, [path])
             settings[key] = {"canonical": canonical_name(body)}
     elif source.rest_mesh is not None:

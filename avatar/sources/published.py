@@ -69,7 +69,7 @@ def split_frames(frames: Iterable[SourceFrame], outfit: str, name: str) -> list[
     if not 0 < len(tested) < len(sequences):
         there = ", ".join(key or "single scans" for key, _ in sequences)
         raise AvatarError(
-            f"split: expected sequences of {outfit} to train on and to test on, {name} leaves none: {there}."
+            f"split: expected sequences to train on and to test on, {name} tests on all or none of {there}."
         )
     for key, group in sequences:
         for place, frame in enumerate(group[split.first :]):

@@ -49,9 +49,7 @@ class ScanimateSource(FittedSource):
     def parameters(self, frame: SourceFrame) -> SmplParameters:
         if len(frame.files) < 2:
             expected = " or ".join(frame.files[0].with_suffix(suffix).name for suffix in FORMATS)
-            raise DataError(
-                frame.files[0], f"expected the body's parameters in {expected} beside it, there is neither."
-            )
+            raise DataError(frame.files[0], f"expected body parameters in {expected} beside it, there are none.")
         return read_parameters(frame.files[1])
 
     def scan(self, frame: SourceFrame) -> RawSurface:
