@@ -6,12 +6,12 @@ import re
 from functools import cached_property
 from pathlib import Path
 
-from avatar.checks import DataError, plain_name
+from avatar.checks import plain_name
 from avatar.io.npz import npz_keys, read_arrays
 from avatar.io.raw_surface import RawSurface
 from avatar.io.surfaces import read_surface
 from avatar.sources.base import SourceFrame, numbered, sorted_frames, subfolders
-from avatar.sources.fitted import FittedSource, scan_of_arrays
+from avatar.sources.fitted import FittedSource, minimal_body, scan_of_arrays
 from avatar.sources.parameters import SmplParameters, parameters_of
 
 KEYS = {"pose": "number ...", "transl": "number ..."}
@@ -65,14 +65,7 @@ class CapeRawSource(FittedSource):
 
     @cached_property
     def rest_path(self) -> Path | None:
-        folders = [self._root / "minimal_body_shape" / self._subject, self._root / "minimal_body_shape"]
-        places = [folder / f"{self._subject}{end}" for folder in folders for end in ("_minimal.npy", "_minimal.ply")]
-        found = next((place for place in places if place.is_file()), None)
-        if found is None and not self.config.body.betas:
-            raise DataError(
-                places[0], "expected the subject's minimal body, there is none.", "Hint: or give body.betas."
-            )
-        return found
+        return minimal_body(self._root, self._subject)
 
     def parameters(self, frame: SourceFrame) -> SmplParameters:
         return parameters_of(frame.files[-1], read_arrays(frame.files[-1], KEYS))

@@ -18,7 +18,7 @@ from avatar.sources.fitted import FittedSource, scan_of_arrays
 from avatar.sources.parameters import SmplParameters, read_parameters
 
 SCANS, LABELS = "Meshes_pkl", Path("Semantic", "labels")
-FITS = {"smplx": ("SMPLX", "smplx"), "smpl": ("SMPL", "smpl")}  # folder and ending of each kind of body
+FITS = {"smplx": "SMPLX", "smpl": "SMPL"}  # folders of the kinds of body
 
 
 class Dress4dSource(FittedSource):
@@ -40,21 +40,20 @@ class Dress4dSource(FittedSource):
     @classmethod
     def find(cls, path: Path) -> dict[str, Path]:
         inside = [folder for subject in (path, *subfolders(path)) for folder in subfolders(subject)]
-        outfits = [folder for folder in (path, *inside) if any((take / SCANS).is_dir() for take in subfolders(folder))]
+        outfits = [folder for folder in (path, *inside) if any(map(_scans, subfolders(folder)))]
         return {
             plain_name("_".join(folder.resolve().parts[-2:]), "outfit"): folder for folder in dict.fromkeys(outfits)
         }
 
     @cached_property
     def frames(self) -> tuple[SourceFrame, ...]:
-        folder, ending = FITS[self._fitted]
         found = []
         for take in subfolders(self.path):
-            for path in sorted((take / SCANS).glob("mesh-*.pkl")):
+            for path in _scans(take):
                 number = path.stem.removeprefix("mesh-")  # f00011
-                fits = take / folder / f"{path.stem}_{ending}.pkl"
-                others = [fits.with_suffix(".ply"), take / LABELS / f"label-{number}.pkl"]
-                files = (path, *(file for file in others if file.is_file()), fits)
+                fits = take / FITS[self._fitted] / f"{path.stem}_{self._fitted}.pkl"
+                others = [fits.with_suffix(".ply"), take / LABELS / f"label-{number}.pkl", fits]
+                files = (path, *(file for file in others if file.is_file()))
                 count = numbered(number)[1]
                 name = plain_name(f"{take.name}.{count:05d}", "frame")
                 found.append(SourceFrame(name, "", files, take.name, count))
@@ -76,6 +75,11 @@ class Dress4dSource(FittedSource):
         return str(found.get("gender", ""))
 
     def parameters(self, frame: SourceFrame) -> SmplParameters:
+        if not frame.files[-1].stem.endswith(self._fitted):
+            name = f"{frame.files[0].stem}_{self._fitted}.pkl"
+            raise DataError(
+                frame.files[0], f"expected the body's parameters in {FITS[self._fitted]}/{name}, there are none."
+            )
         return read_parameters(frame.files[-1])
 
     def scan(self, frame: SourceFrame) -> RawSurface:
@@ -101,3 +105,7 @@ class Dress4dSource(FittedSource):
                 path, f"scan_labels: expected whole numbers from 0 to 255, got {labels.min()} to {labels.max()}."
             )
         return labels.astype(np.uint8)
+
+
+def _scans(take: Path) -> list[Path]:
+    return sorted((take / SCANS).glob("mesh-*.pkl"))

@@ -51,8 +51,6 @@ class FiteSource(FittedSource):
     def rest_path(self) -> Path | None:
         subject = self.path.resolve().name
         path = self._templates / subject / f"{subject}_minimal_tpose.ply"
-        if not path.is_file() and not self.config.body.betas:
-            raise DataError(path, "expected the subject's minimal body, there is none.", "Hint: or give body.betas.")
         return path if path.is_file() else None
 
     @cached_property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,7 @@ from avatar.sources.base import PosedScan, Source, SourceConfig, SourceFrame
 from avatar.sources.parameters import SmplParameters
 
 SPREAD = 0.5  # standard deviations between the shapes of one person's fits that are worth a warning
+MINIMAL = (".npy", ".obj", ".ply")
 log = logging.getLogger(__name__)
 
 
@@ -75,7 +77,7 @@ class FittedSource(Source):
     def keeps_hands(self) -> bool:
         """Whether hands and face are posed: as ``body.all_joints`` says, else where the fits have their rotations."""
         asked = self.config.body.all_joints
-        cut = asked is None and self.parameters(self.frames[0]).hands
+        cut = asked is None and next(self._valid_parameters()).hands
         if cut:
             log.warning("%s: hands are principal components: hands and face are laid at rest.", self.path)
         return not cut if asked is None else asked
@@ -83,7 +85,7 @@ class FittedSource(Source):
     @cached_property
     def betas(self) -> list[float]:
         """The mean of the fits' shapes; empty where they have none."""
-        shapes = [self.parameters(frame).betas for frame in self.frames]
+        shapes = [parameters.betas for parameters in self._valid_parameters()]
         if len({len(shape) for shape in shapes}) != 1:
             raise DataError(
                 self.path, "betas: expected equally many in all fits, got others.", "Hint: give body.betas."
@@ -92,6 +94,20 @@ class FittedSource(Source):
         if mean.size and (spread := float(np.abs(shapes - mean).max())) > SPREAD:
             log.warning("%s: shapes differ by up to %.1f from their mean, which is taken.", self.path, spread)
         return mean.tolist()
+
+    def _valid_parameters(self) -> Iterator[SmplParameters]:
+        """The parameters of every frame that has valid ones; raises the first error where none has."""
+        errors, valid = [], 0
+        for frame in self.frames:
+            try:
+                parameters = self.parameters(frame)
+            except DataError as error:
+                errors.append(error)
+            else:
+                valid += 1
+                yield parameters
+        if not valid:
+            raise errors[0] if errors else DataError(self.path, "expected scans, there are none.")
 
     @cached_property
     def body(self) -> BodyModel:
@@ -102,8 +118,11 @@ class FittedSource(Source):
             raise DataError(self.path, problem, f"Hint: {way_to_file(self.kind)}, and give body.path=<file.npz>.")
         if holds_template(config.path):
             return body_of_file(config.path, {"canonical": config.canonical}, "body.")
-        rest = None if config.betas or self.rest_path is None else self.rest_path
-        betas = config.betas or (() if rest else self.betas)
+        rest = None if config.betas else self.rest_path
+        betas = config.betas or ([] if rest else self.betas)
+        if rest is None and not betas:
+            problem = "expected this person's shape: a minimal body in the T-pose, betas of the fits or body.betas="
+            raise self.missing(self.path, f"{problem}, there is none.")
         hint = "Hint: body.path must be the kind of model that was fitted: SMPL has 6890 vertices, SMPL-X 10475."
         with naming(rest or config.path, hint if rest else ""):
             vertices = None if rest is None else read_rest(rest)
@@ -152,6 +171,13 @@ def read_rest(path: Path) -> np.ndarray:
     """The vertices ``(V, 3)`` float64 of a minimal body in the T-pose, from an npy file or a mesh."""
     vertices = read_npy(path, "float V 3") if path.suffix == ".npy" else read_mesh(path).vertices
     return vertices.astype(np.float64)
+
+
+def minimal_body(root: Path, subject: str) -> Path | None:
+    """A subject's minimal body in the T-pose below ``minimal_body_shape``; None where there is none."""
+    folder = root / "minimal_body_shape"
+    files = [path for path in sorted(folder.rglob("*")) if path.suffix in MINIMAL and path.is_file()]
+    return next((path for path in files if subject in path.relative_to(folder).as_posix()), None)
 
 
 def scan_of_arrays(

@@ -13,7 +13,7 @@ from avatar.data.folders import SPLITS
 from avatar.io.npz import naming, npz_keys, read_arrays
 from avatar.io.raw_surface import RawSurface
 from avatar.sources.base import PosedScan, SourceFrame, numbered, outfits_at, sorted_frames, subfolders
-from avatar.sources.fitted import FittedSource, scan_of_arrays
+from avatar.sources.fitted import FittedSource, minimal_body, scan_of_arrays
 from avatar.sources.parameters import SmplParameters, parameters_of
 
 SCAN = {"scan_pc": "float M 3", "scan_n": "float M 3"}
@@ -56,16 +56,11 @@ class PackedSource(FittedSource):
     @cached_property
     def rest_path(self) -> Path | None:
         root = self.path.parent.parent if self.path.parent.name == "packed" else self.path.parent
-        names = (self.name, self.name.partition("_")[0])  # CAPE's subjects stand before the clothes' name
-        places = [self.path / "template.obj", root / "template.obj"]
-        for folder in (root / "minimal_body_shape", root.parent / "minimal_body_shape"):
-            places += [folder / f"{name}{suffix}" for name in names for suffix in (".obj", ".ply", ".npy")]
-            places += [folder / name / f"{name}_minimal{suffix}" for name in names for suffix in (".ply", ".npy")]
-        return next((place for place in places if place.is_file()), None)
-
-    @cached_property
-    def betas(self) -> list[float]:
-        return []  # no such file has them
+        subject = self.name.partition("_")[0]  # of CAPE's outfits; ReSynth's are subjects of their own
+        names = [self.name, *([subject] if subject.isdigit() else [])]
+        given = (folder / "template.obj" for folder in (self.path, root) if (folder / "template.obj").is_file())
+        shapes = (minimal_body(folder, name) for folder in (root, root.parent) for name in names)
+        return next(filter(None, (*given, *shapes)), None)
 
     @cached_property
     def keeps_hands(self) -> bool:
@@ -83,7 +78,9 @@ class PackedSource(FittedSource):
         return self.rest_path
 
     def parameters(self, frame: SourceFrame) -> SmplParameters:
-        return parameters_of(frame.files[-1], read_arrays(frame.files[-1], {"body_pose": "number ..."}))
+        if len(frame.files) < 2:
+            raise DataError(frame.files[0], "expected SkiRT's file of this frame, there is none.")
+        return parameters_of(frame.files[1], read_arrays(frame.files[1], {"body_pose": "number ..."}))
 
     def scan(self, frame: SourceFrame) -> RawSurface:
         stored = read_arrays(frame.files[0], SCAN)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from foreign_layouts import WRITERS, mesh_of, shaped, write_bodies, write_pickle
 from scipy.spatial import cKDTree
+from smpl_person import BETAS
 from tiny import SETTINGS, quick_training
 
 from avatar.api import Avatar, to_mesh
@@ -181,13 +182,39 @@ def test_skirt_files_give_pose_and_mean_shape(change, tmp_path):
     ("layout", "pattern"),
     [("packed", "minimal_body_shape"), ("cape_raw", "minimal_body_shape"), ("fite", "data_templates")],
 )
-def test_a_missing_minimal_body_is_named(layout, pattern, change):
+def test_a_body_needs_a_shape(layout, pattern, change):
     config = change(layout)
     shutil.rmtree(config.source / pattern)
-    if layout == "packed":
-        config.body = SourceBody()
-    with pytest.raises(DataError, match=r"expected (a|the subject's) minimal body"):
+    with pytest.raises(DataError, match=r"expected this person's shape: .*there is none\."):
+        read(config)
+    config.body.betas = list(BETAS)
+    read(config)
+
+
+def test_frames_of_pop_need_a_body_at_rest(change):
+    config = change("packed", body=SourceBody())
+    shutil.rmtree(config.source / "minimal_body_shape")
+    with pytest.raises(DataError, match=r"expected a minimal body in its T-pose or body\.path, there is neither"):
         convert(config)
+
+
+def test_a_scan_of_4d_dress_without_a_fit_is_named(change):
+    config = change("dress4d")
+    (config.source / "00122" / "Outer" / "Take2" / "SMPLX" / "mesh-f00011_smplx.pkl").unlink()
+    with pytest.raises(DataError, match=r"mesh-f00011\.pkl: expected .* SMPLX/mesh-f00011_smplx\.pkl, there are none"):
+        read(config)
+    convert(replace(config, skip_invalid=True))
+
+
+def test_smpl_bodies_of_4d_dress_are_read_for_such_a_model(change, bodies, originals):
+    config = change("dress4d", body=SourceBody(path=bodies["smpl"]))
+    for path in config.source.rglob("*_smplx.pkl"):
+        stored = pickle.loads(path.read_bytes())
+        pose = np.concatenate([stored["body_pose"][0], np.zeros(6)])
+        kept = {key: stored[key] for key in ("global_orient", "transl", "betas")} | {"body_pose": pose}
+        write_pickle(path.parents[1] / "SMPL" / path.name.replace("smplx", "smpl"), kept)
+    shutil.rmtree(config.source / "00122" / "Outer" / "Take2" / "SMPLX")
+    assert {arrays["pose"].shape for arrays in read(config)} == {(24, 3)}
 
 
 def test_a_minimal_body_of_another_model_is_refused(change, person):
