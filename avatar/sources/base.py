@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from avatar.body.model import BodyModel
-from avatar.checks import DataError, plain_name, sentences, unknown_name
+from avatar.checks import DataError, plain_name, unknown_name
 from avatar.geometry.units import METRES
 from avatar.io.raw_surface import RawSurface
 
@@ -145,8 +145,8 @@ class Source(ABC):
     @classmethod
     def missing(cls, path: Path, problem: str) -> DataError:
         """The error of files that are not there: the layout that is expected, and where such data are to be had."""
-        home = f" To be had at {cls.home}." if cls.home else ""
-        return DataError(path, problem, sentences(f"Hint: layout {cls.layout} has\n{cls.expected}\n", home.strip()))
+        home = f"\nTo be had at {cls.home}." if cls.home else ""
+        return DataError(path, problem, f"Hint: layout {cls.layout} has\n{cls.expected}{home}")
 
     @classmethod
     @abstractmethod

@@ -22,7 +22,7 @@ FITS = {"smplx": "SMPLX", "smpl": "SMPL"}  # folders of the kinds of body
 
 
 class Dress4dSource(FittedSource):
-    """A subject's Inner or Outer outfit; each take is a sequence. Labels keep the data set's own numbers, 0 is skin.
+    """A subject's Inner or Outer outfit; each take is a sequence. Labels keep the data set's own numbers.
 
     Bodies are SMPL-X's, or SMPL's where ``body.path`` is such a file.
     """

@@ -34,7 +34,8 @@ class FittedSource(Source):
     """An outfit of scans with SMPL-family parameters; body and scan have the same axes and, but for a unit, origin.
 
     The body is ``body.path`` in the shape of ``body.betas``, else of the layout's minimal T-pose mesh (`rest_path`),
-    else of the mean of the fits' own betas. Raises `AvatarError` for another ``up`` than y.
+    else of the mean of the fits' own betas; `DataError` without a model or a shape. Raises `AvatarError` for another
+    ``up`` than y.
     """
 
     kind: ClassVar[str] = "smpl"  # the model that was fitted
@@ -87,9 +88,8 @@ class FittedSource(Source):
         """The mean of the fits' shapes; empty where they have none."""
         shapes = [parameters.betas for parameters in self._valid_parameters()]
         if len({len(shape) for shape in shapes}) != 1:
-            raise DataError(
-                self.path, "betas: expected equally many in all fits, got others.", "Hint: give body.betas."
-            )
+            problem = "betas: expected equally many in all fits, got others."
+            raise DataError(self.path, problem, "Hint: give body.betas.")
         mean = np.mean(shapes, axis=0)
         if mean.size and (spread := float(np.abs(shapes - mean).max())) > SPREAD:
             log.warning("%s: shapes differ by up to %.1f from their mean, which is taken.", self.path, spread)
@@ -116,7 +116,7 @@ class FittedSource(Source):
             gender = f"a {self.gender} " if self.gender else "a "
             problem = f"expected {gender}body of kind {self.kind} that can be posed, body.path names none."
             raise DataError(self.path, problem, f"Hint: {way_to_file(self.kind)}, and give body.path=<file.npz>.")
-        if holds_template(config.path):
+        if config.path.suffix != ".npz" or holds_template(config.path):
             return body_of_file(config.path, {"canonical": config.canonical}, "body.")
         rest = None if config.betas else self.rest_path
         betas = config.betas or ([] if rest else self.betas)

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from avatar.body.model import BodyModel
+from avatar.body.packed import holds_template
+from avatar.body.smpl import converted_kind
 from avatar.checks import DataError
 from avatar.data.folders import SPLITS
 from avatar.io.npz import naming, npz_keys, read_arrays
@@ -64,7 +66,8 @@ class PackedSource(FittedSource):
 
     @cached_property
     def keeps_hands(self) -> bool:
-        return bool(self.config.body.all_joints)
+        asked, path = self.config.body.all_joints, self.config.body.path
+        return converted_kind(path) == "smpl" if asked is None and not holds_template(path) else bool(asked)
 
     @property
     def body(self) -> BodyModel | None:

@@ -77,4 +77,4 @@ def split_frames(frames: Iterable[SourceFrame], outfit: str, name: str) -> list[
                 found.append(replace(frame, split="test" if key in tested else "train"))
             elif split.between and place % split.step == split.between:
                 found.append(replace(frame, split="interpolation"))
-    return found
+    return sorted(found, key=lambda frame: (frame.split, frame.sequence, frame.number, frame.name))

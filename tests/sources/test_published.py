@@ -1,11 +1,12 @@
 """Outfit lists and splits of papers: plain names, each once, and frames that go where the paper has them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from avatar.checks import SAFE_NAME, AvatarError
-from avatar.sources.base import SourceFrame, numbered
+from avatar.checks import SAFE_NAME, AvatarError, DataError
+from avatar.sources.base import SourceFrame, numbered, outfits_at, sorted_frames
 from avatar.sources.published import named_outfits, published_outfits, published_splits, split_frames
 
 
@@ -40,7 +41,7 @@ def test_a_list_stands_for_its_outfits():
 def test_sequences_of_capes_motions_are_tested_on():
     frames = sequences(shortlong_ATUsquat_trial1=4, shortlong_ballerina_spin_trial2=3)
     found = split_frames(frames, "00096_shortlong", "cape")
-    assert [(frame.split, frame.number) for frame in found] == [("train", 2), ("train", 3), ("test", 2)]
+    assert [(frame.split, frame.number) for frame in found] == [("test", 2), ("train", 2), ("train", 3)]
     with pytest.raises(AvatarError, match="expected sequences to train on and to test on, cape tests on all or none"):
         split_frames(frames[:4], "00096_shortlong", "cape")
 
@@ -53,8 +54,21 @@ def test_scanimate_trains_on_every_tenth_frame_of_four_sequences_in_five():
     assert len(tested) == 1 and sum(frame.split == "test" for frame in found) == 21
     trained = [frame for frame in found if frame.split == "train"]
     assert {frame.number for frame in trained} == {0, 10, 20} and len(trained) == 12
+    assert [frame.split for frame in found] == sorted(frame.split for frame in found)
     between = [frame for frame in found if frame.split == "interpolation"]
     assert {frame.number for frame in between} == {5, 15} and not tested & {frame.sequence for frame in between}
+
+
+def test_frames_and_outfits_of_one_name_are_refused(tmp_path):
+    frames = sequences(walk=2)
+    assert sorted_frames(tmp_path, frames[::-1]) == tuple(frames)
+    twin = replace(frames[0], files=(Path("other.ply"),))
+    with pytest.raises(
+        DataError, match=r"expected every frame once, scan\.ply and other\.ply are both called walk\.000"
+    ):
+        sorted_frames(tmp_path, [*frames, twin])
+    with pytest.raises(DataError, match=r"expected every outfit once, a/coat has the name coat too"):
+        outfits_at([Path("a/coat"), Path("b/coat")])
 
 
 def test_one_take_of_4d_dress_is_tested_on():
