@@ -48,13 +48,20 @@ def smplx_person(person: Model) -> Model:
         weights[:, wrist] += person["weights"][:, hand]
     posedirs = np.zeros((vertices, 3, 9 * 54))
     posedirs[..., : 9 * 21] = person["posedirs"][..., : 9 * 21]
-    return person | {
-        "weights": weights,
-        "J_regressor": person["J_regressor"][owners],
-        "posedirs": posedirs,
-        "shapedirs": np.concatenate([person["shapedirs"], np.zeros_like(person["shapedirs"])], axis=-1),
-        "kintree_table": np.array([[2**32 - 1, *parents[1:]], range(55)], np.int64).astype(np.uint32),
-    }
+    rng = np.random.default_rng(0)
+    hands = {f"hands_mean{side}": 0.2 * rng.normal(size=45) for side in "lr"}
+    hands |= {f"hands_components{side}": 0.2 * rng.normal(size=(45, 45)) for side in "lr"}
+    return (
+        person
+        | hands
+        | {
+            "weights": weights,
+            "J_regressor": person["J_regressor"][owners],
+            "posedirs": posedirs,
+            "shapedirs": np.concatenate([person["shapedirs"], np.zeros_like(person["shapedirs"])], axis=-1),
+            "kintree_table": np.array([[2**32 - 1, *parents[1:]], range(55)], np.int64).astype(np.uint32),
+        }
+    )
 
 
 def write_bodies(folder: Path, person: Model) -> dict[str, Path]:

@@ -33,6 +33,7 @@ REQUIRED_KEYS = {
     **{"faces": "int F 3", "kind": "text 1", "parents": "int J", "joint_names": "text J"},
 }
 OPTIONAL_KEYS = {"posedirs": "float V 3 P", "uv": "float U 2", "uv_faces": "int F 3"}
+HAND_KEYS = {"hand_means": "float 2 45", "hand_components": "float 2 45 45"}  # left, right
 
 
 def _hands(first: int) -> dict[str, int]:
@@ -112,6 +113,20 @@ def merge_weights(weights: np.ndarray, parents: Sequence[int], count: int) -> np
     return merged[:, :count]
 
 
+def hand_rotations(path: Path, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Rotations of the finger joints ``(30, 3)``, left before right, of principal components ``(C,)`` of each hand.
+
+    As smplx reads them: the model's mean hand and the sum of its first C components. Raises `DataError` for a converted
+    model without components, which only SMPL-H and SMPL-X files have.
+    """
+    stored = read_arrays(path, {}, HAND_KEYS)
+    if len(stored) < len(HAND_KEYS):
+        hint = "Hint: convert the SMPL-X or SMPL-H file again; earlier conversions left them out."
+        raise DataError(path, "expected principal components of hands, there are none.", hint)
+    sides = zip((left, right), stored["hand_means"], stored["hand_components"])
+    return np.concatenate([mean + values @ parts[: len(values)] for values, mean, parts in sides]).reshape(30, 3)
+
+
 def way_to_file(kind: str, path: Path | None = None) -> str:
     """Where a model is to be had, and the command that makes our file of it."""
     line = f"python tools/convert_body.py <downloaded file> {shlex.quote(str(path)) if path else '<file.npz>'}"
@@ -144,6 +159,10 @@ SHAPE_COMPONENTS = {20: 10, 400: 300}  # SMPL-X stores expression blendshapes be
 SOURCE_KEYS = {key: f"number {shape}" for key, shape in MODEL_SHAPES.items()}
 SOURCE_KEYS |= {"f": "int F 3", "kintree_table": "int 2 J"}
 OPTIONAL_SOURCE_KEYS = {"posedirs": "number V 3 P", "vt": "number U 2", "ft": "number F 3"}  # vt, ft: an atlas
+SOURCE_HANDS = {
+    f"hands_{key}{side}": f"number {shape}" for key, shape in (("mean", "45"), ("components", "45 45")) for side in "lr"
+}
+OPTIONAL_SOURCE_KEYS |= SOURCE_HANDS
 
 
 def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> str:
@@ -196,6 +215,10 @@ def _plain_model(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     for key, array in plain.items():
         check_finite(key, array)
     plain["faces"] = arrays["f"].astype(np.int32)
+    if SOURCE_HANDS.keys() <= arrays.keys():
+        for key, parts in zip(HAND_KEYS, ("hands_meanl hands_meanr", "hands_componentsl hands_componentsr")):
+            plain[key] = np.stack([arrays[part].astype(np.float32) for part in parts.split()])
+            check_finite(key, plain[key])
     if "vt" in arrays and "ft" in arrays:
         if not np.array_equal(arrays["ft"], np.rint(arrays["ft"])):  # some files keep whole numbers as floats
             raise AvatarError("ft: expected whole numbers, got others.")

@@ -76,12 +76,15 @@ class FittedSource(Source):
 
     @cached_property
     def keeps_hands(self) -> bool:
-        """Whether hands and face are posed: as ``body.all_joints`` says, else where the fits have their rotations."""
-        asked = self.config.body.all_joints
-        cut = asked is None and next(self._valid_parameters()).hands
-        if cut:
-            log.warning("%s: hands are principal components: hands and face are laid at rest.", self.path)
-        return not cut if asked is None else asked
+        """Whether hands and face are posed: as ``body.all_joints`` says, else where the fits' can be read."""
+        if self.config.body.all_joints is not None:
+            return self.config.body.all_joints
+        try:
+            next(self._valid_parameters()).with_fingers(self.config.body.path)
+        except DataError as error:
+            log.warning("%s: hands and face are laid at rest. %s", self.path, error)
+            return False
+        return True
 
     @cached_property
     def betas(self) -> list[float]:
@@ -135,11 +138,11 @@ class FittedSource(Source):
 
     def read(self, frame: SourceFrame) -> PosedScan:
         parameters, scan = self.parameters(frame), self.scan(frame)
-        if self.keeps_hands and parameters.hands:
-            hint = "Hint: body.all_joints=false lays hands and face at rest."
-            raise DataError(frame.files[-1], "hands: expected rotations, got principal components.", hint)
+        body = self.body
+        if self.keeps_hands:
+            parameters = parameters.with_fingers(self.config.body.path)
         with naming(frame.files[-1]):
-            pose = parameters.pose_of(self.body, cut=not self.keeps_hands)
+            pose = parameters.pose_of(body, cut=not self.keeps_hands)
         unit = self.config.units
         if unit == "auto":
             unit = self.unit_of(scan) if parameters.scale == 1 else "m"  # a fitted scale is all there is to the unit

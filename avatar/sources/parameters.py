@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
@@ -11,11 +11,12 @@ import numpy as np
 
 from avatar.body.inert_pickle import read_pickled_arrays
 from avatar.body.model import SMPL_JOINTS, BodyModel
-from avatar.body.smpl import joint_tree
+from avatar.body.smpl import hand_rotations, joint_tree
 from avatar.checks import AvatarError, DataError, check_finite, check_suffix
 from avatar.io.documents import read_json
 from avatar.io.npz import naming, read_arrays
 
+FINGERS = joint_tree("smplx")[0][25:]
 FORMATS = (".npz", ".pkl", ".json")
 NAMES = {  # the joints of a whole pose, by their number
     len(SMPL_JOINTS): tuple(SMPL_JOINTS),
@@ -29,9 +30,9 @@ PARTS = {  # parts of a pose, the joints of each, and its keys
     "left eye": (SMPLX_NAMES[23:24], ("leye_pose",)),
     "right eye": (SMPLX_NAMES[24:25], ("reye_pose",)),
     "eyes": (SMPLX_NAMES[23:25], ("pose_eye",)),
-    "left hand": (SMPLX_NAMES[25:40], ("left_hand_pose",)),
-    "right hand": (SMPLX_NAMES[40:55], ("right_hand_pose",)),
-    "hands": (SMPLX_NAMES[25:55], ("pose_hand", "hand_pose")),
+    "left hand": (FINGERS[:15], ("left_hand_pose",)),
+    "right hand": (FINGERS[15:], ("right_hand_pose",)),
+    "hands": (FINGERS, ("pose_hand", "hand_pose")),
 }
 INNER, OUTER = ("transl", "trans"), ("translation",)  # of the body, and of what scale has made of it
 BETAS = ("betas", "shape", "beta")
@@ -42,8 +43,8 @@ KEYS = (*WHOLE, *ROOT, *BODY, *chain(*(keys for _, keys in PARTS.values())), *IN
 class SmplParameters:
     """One body: ``pose (J, 3)`` axis-angle of the joints ``names``, radians; a scan's points are ``scale (body + t)``.
 
-    ``translation (3,)`` is t, in the body's own metres; ``betas (S,)`` are empty where the file has none. ``hands``
-    tells of fingers that are given as coefficients of principal components, which are not in the pose.
+    ``translation (3,)`` is t, in the body's own metres; ``betas (S,)`` are empty where the file has none. ``hands`` are
+    left and right one as coefficients of principal components ``(C,)``, None where fingers are in the pose or nowhere.
     """
 
     names: tuple[str, ...]
@@ -51,7 +52,14 @@ class SmplParameters:
     translation: np.ndarray
     betas: np.ndarray
     scale: float = 1.0
-    hands: bool = False
+    hands: tuple[np.ndarray, np.ndarray] | None = None
+
+    def with_fingers(self, model: Path) -> SmplParameters:
+        """The same with fingers as rotations, of the components in a converted model; errors as in `hand_rotations`."""
+        if self.hands is None:
+            return self
+        turns = np.concatenate([self.pose, hand_rotations(model, *self.hands)])
+        return replace(self, names=(*self.names, *FINGERS), pose=turns, hands=None)
 
     def pose_of(self, body: BodyModel, cut: bool = False) -> np.ndarray:
         """The pose ``(J, 3)`` float32 of a body's joints, by their names; those that the file lacks are at rest.
@@ -74,8 +82,9 @@ def read_parameters(path: Path) -> SmplParameters:
 
     Poses are whole (66, 72, 156 or 165 numbers; ``pose``, ``poses``, ``fullpose``) or in parts (``global_orient`` and
     ``body_pose`` of 63 or 69, hands, jaw, eyes), flat or ``(J, 3)``, with an axis of one frame before them or not.
-    ``transl`` and ``trans`` are scaled with the body, ``translation`` is added behind ``scale``, as THuman's fits have
-    it. Raises `DataError` naming the file and the key: missing, of several frames, matrices, degrees, not finite.
+    Hands may be principal components instead. ``transl`` and ``trans`` are scaled with the body, ``translation`` is
+    added behind ``scale``, as THuman's fits have it. Raises `DataError` naming the file and the key: missing, of
+    several frames, matrices, degrees, not finite.
     """
     check_suffix(path, FORMATS, "body parameters")
     return parameters_of(path, _read_keys(path))
@@ -97,13 +106,17 @@ def parameters_of(path: Path, found: Mapping[str, np.ndarray]) -> SmplParameters
     else:
         keys = ", ".join(sorted(found)) or "none of them"
         raise DataError(path, f"expected pose, or global_orient and body_pose, found {keys}.")
-    hands = False
+    hands: list[np.ndarray] = []
     for names, keys in PARTS.values():
         for key in (key for key in keys if key in found):
             if "hand" in key and len(found[key]) != 3 * len(names):
-                hands = True
+                hands += np.array_split(found[key], 2) if len(names) == 30 else [found[key]]
             else:
                 turns |= _turns(path, key, found[key], {3 * len(names): names})
+    counts = [len(hand) for hand in hands]
+    if hands and not (len(hands) == 2 and counts[0] == counts[1] <= 45):
+        problem = f"expected as many principal components of both, at most 45, got {' and '.join(map(str, counts))}."
+        raise DataError(path, f"hands: {problem}")
     pose = np.stack(list(turns.values()))
     if (largest := float(np.linalg.norm(pose, axis=1).max())) > 4 * np.pi:
         raise DataError(path, f"pose: expected radians, got turns of {largest:.0f}.", "Hint: convert degrees first.")
@@ -114,7 +127,7 @@ def parameters_of(path: Path, found: Mapping[str, np.ndarray]) -> SmplParameters
     if len(inner) != 3 or len(outer) != 3:
         raise DataError(path, f"transl: expected 3 numbers, got {max(len(inner), len(outer))}.")
     betas = next((found[key] for key in BETAS if key in found), np.zeros(0))
-    return SmplParameters(tuple(turns), pose, inner + outer / scale, betas, scale, hands)
+    return SmplParameters(tuple(turns), pose, inner + outer / scale, betas, scale, tuple(hands) or None)
 
 
 def _read_keys(path: Path) -> dict[str, np.ndarray]:

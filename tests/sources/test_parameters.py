@@ -70,8 +70,40 @@ def test_translation_is_added_behind_the_scale_and_transl_before(scale, tmp_path
 
 
 def test_principal_components_of_hands_are_told_apart(tmp_path):
-    found = write(tmp_path / "fit.npz", PARTS | {"left_hand_pose": np.ones(12), "transl": SHIFT})
-    assert found.hands and len(found.names) == 40 and "left_index1" not in found.names
+    components = {"left_hand_pose": np.arange(12.0), "right_hand_pose": np.ones((1, 12))}
+    found = write(tmp_path / "fit.npz", PARTS | components | {"transl": SHIFT})
+    assert len(found.names) == 25 and "left_index1" not in found.names
+    joined = {"pose_hand": np.concatenate([np.arange(12.0), np.ones(12)])}
+    for one in (found, write(tmp_path / "fit.npz", AMASS | joined)):
+        np.testing.assert_array_equal(one.hands[0], np.arange(12))
+        np.testing.assert_array_equal(one.hands[1], np.ones(12))
+
+
+def test_components_of_hands_become_rotations_as_smplx_has_them(tmp_path):
+    rng = np.random.default_rng(1)
+    model = vars(random_model("smplx"))
+    hands = {f"hands_mean{side}": rng.normal(size=45) for side in "lr"}
+    hands |= {f"hands_components{side}": rng.normal(size=(45, 45)) for side in "lr"}
+    np.savez(tmp_path / "model.npz", **model | hands)
+    np.savez(tmp_path / "bare.npz", **model)
+    for name in ("model", "bare"):
+        convert_body_model(tmp_path / f"{name}.npz", tmp_path / f"{name}_plain.npz")
+    values = {"left_hand_pose": rng.normal(size=12), "right_hand_pose": rng.normal(size=12)}
+    found = write(tmp_path / "fit.npz", PARTS | values)
+    whole = found.with_fingers(tmp_path / "model_plain.npz")
+    expected = [
+        hands[f"hands_mean{side}"] + values[f"{name}_hand_pose"] @ hands[f"hands_components{side}"][:12]
+        for side, name in (("l", "left"), ("r", "right"))
+    ]
+    assert whole.names[25:] == joint_tree("smplx")[0][25:] and whole.hands is None
+    np.testing.assert_allclose(whole.pose[25:].reshape(2, 45), expected, rtol=1e-5)
+    with pytest.raises(DataError, match=r"bare_plain\.npz: expected principal components of hands, there are none"):
+        found.with_fingers(tmp_path / "bare_plain.npz")
+
+
+def test_components_of_one_hand_alone_are_refused(tmp_path):
+    with pytest.raises(DataError, match="hands: expected as many principal components of both, at most 45, got 12"):
+        write(tmp_path / "fit.npz", PARTS | {"left_hand_pose": np.zeros(12)})
 
 
 def test_rotations_go_to_joints_of_their_names(tmp_path):

@@ -281,14 +281,21 @@ def test_labels_and_colours_of_4d_dress_are_kept(change):
     np.testing.assert_array_equal(arrays["scan_colors"], 200)
 
 
-def test_hands_as_principal_components_are_laid_at_rest(change, caplog):
+def test_hands_as_principal_components_are_posed_where_the_model_has_them(change, caplog, tmp_path):
     config = change("dress4d")
     for path in config.source.rglob("*_smplx.pkl"):
-        write_pickle(path, pickle.loads(path.read_bytes()) | {"left_hand_pose": np.ones((1, 12), np.float32)})
+        hands = dict.fromkeys(("left_hand_pose", "right_hand_pose"), np.zeros((1, 12), np.float32))
+        write_pickle(path, pickle.loads(path.read_bytes()) | hands)
+    with np.load(config.body.path) as stored:
+        arrays = dict(stored)
+    for found in read(config):
+        np.testing.assert_allclose(found["pose"][25:].reshape(2, 45), arrays["hand_means"], rtol=1e-6)
+    np.savez(tmp_path / "bare.npz", **{key: value for key, value in arrays.items() if not key.startswith("hand_")})
+    config.body.path = tmp_path / "bare.npz"
     with caplog.at_level(logging.WARNING):
-        assert {arrays["pose"].shape for arrays in read(config)} == {(22, 3)}
-    assert "principal components: hands and face are laid at rest" in caplog.text
-    with pytest.raises(DataError, match=r"hands: expected rotations.*body\.all_joints=false"):
+        assert {found["pose"].shape for found in read(config)} == {(22, 3)}
+    assert "hands and face are laid at rest" in caplog.text and "convert the SMPL-X or SMPL-H file again" in caplog.text
+    with pytest.raises(DataError, match=r"bare\.npz: expected principal components of hands, there are none"):
         read(replace(config, body=replace(config.body, all_joints=True)))
 
 
