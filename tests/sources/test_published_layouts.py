@@ -281,6 +281,18 @@ def test_labels_and_colours_of_4d_dress_are_kept(change):
     np.testing.assert_array_equal(arrays["scan_colors"], 200)
 
 
+def test_posed_bodies_of_4d_dress_are_taken_from_their_meshes(change, originals, person):
+    """They have the face's expression, which no pose has; one of another frame is refused."""
+    config = change("dress4d")
+    truth = originals("dress4d")[1]["Take11.00011"]
+    path = config.source / "00122" / "Outer" / "Take11" / "SMPLX" / "mesh-f00011_smplx.ply"
+    write_mesh(path, mesh_of(person, truth.body + 0.01))
+    np.testing.assert_allclose(read(config)[0]["body_verts"], truth.body + 0.01, atol=MICROMETRE)
+    write_mesh(path, mesh_of(person, truth.body + 0.1))
+    with pytest.raises(DataError, match=r"pose: expected it to put the template on the frame's body.*A move of"):
+        convert(config)
+
+
 def test_hands_as_principal_components_are_posed_where_the_model_has_them(change, caplog, tmp_path):
     config = change("dress4d")
     for path in config.source.rglob("*_smplx.pkl"):
