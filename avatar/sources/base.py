@@ -15,7 +15,9 @@ import numpy as np
 from avatar.body.model import BodyModel
 from avatar.checks import DataError, plain_name, unknown_name
 from avatar.geometry.units import METRES
+from avatar.invocation import command_line, option
 from avatar.io.raw_surface import RawSurface
+from avatar.records import Template
 
 UPS = ("y", "z", "-y", "-z", "x", "-x")
 
@@ -173,8 +175,13 @@ class Source(ABC):
         return self.body
 
     @property
-    def rest_mesh(self) -> Path | None:
-        """The mesh of the minimal body at rest where that is all that is known of it (POP's layout); None otherwise."""
+    def body_hint(self) -> str:
+        """How the outfit gets a body, where it has none."""
+        return f"Hint: fit one: {command_line('data_fit', option('source', self.path))}"
+
+    @property
+    def mesh_template(self) -> Template | None:
+        """The minimal body's mesh at rest where that is all that is known of it (POP's layout); None otherwise."""
         return None
 
     @property

@@ -74,7 +74,7 @@ class CapeRawSource(FittedSource):
         if len(frame.files) > 1:
             return read_surface(frame.files[0])
         posed = read_arrays(frame.files[0], {"v_posed": "number V 3"})["v_posed"]
-        return scan_of_arrays(frame.files[0], posed, self.body.faces.numpy())
+        return scan_of_arrays(frame.files[0], posed, None if self.body is None else self.body.faces.numpy())
 
     def unit_of(self, scan: RawSurface) -> str:
         return "mm" if scan.path.suffix == ".ply" else "m"

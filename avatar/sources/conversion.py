@@ -21,16 +21,16 @@ from avatar.data.folders import OUTFIT_FORMAT, SPLITS
 from avatar.data.packed_layout import BODY, BODY_FILES, MEAN, PackedOutfit
 from avatar.data.validation import check_frame
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.invocation import command_line, option
 from avatar.io.documents import read_json
 from avatar.io.frames import write_manifest
 from avatar.io.ledger import Ledger, digest_of, file_digest, keyed
 from avatar.io.locks import lock_folder
-from avatar.io.meshes import read_mesh, write_mesh
+from avatar.io.meshes import write_mesh
 from avatar.io.npz import write_arrays, write_whole
 from avatar.io.points import color_bytes
 from avatar.io.raw_surface import vertex_normals
 from avatar.progress import tracked
+from avatar.records import Mesh
 from avatar.settings import settings_to_dict
 from avatar.sources.base import PosedScan, Source, SourceConfig, SourceFrame
 from avatar.sources.normals import oriented_normals
@@ -149,8 +149,7 @@ def packed_arrays(source: Source, frame: SourceFrame, config: ConvertConfig) -> 
     posed = source.read(frame)
     if not posed.fitted:
         problem = "expected a fitted body, nothing beside the scan says how it lies."
-        hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
-        raise DataError(frame.files[0], problem, hint)
+        raise DataError(frame.files[0], problem, source.body_hint)
     arrays = {key: getattr(posed, name) for key, name in FIT_KEYS.items()}
     arrays |= scan_arrays(posed, posed_vertices(source, posed), config.points, frame.name)
     arrays["scan_name"] = np.array(frame.name)
@@ -220,16 +219,15 @@ def write_body_files(folder: Path, source: Source, ledger: Ledger) -> None:
                 write_body(path, body, FAST)
                 ledger.record(key, digest, [path])
             settings[key] = {"canonical": canonical_name(body)}
-    elif source.rest_mesh is not None:
-        mesh = read_mesh(source.rest_mesh)
-        if source.rest_mesh.suffix == ".obj":
-            write_whole(folder / "template.obj", source.rest_mesh.read_bytes())  # with its UV atlas
+    elif (template := source.mesh_template) is not None:
+        path = source.body_files[-1]
+        if path.suffix == ".obj":
+            write_whole(folder / "template.obj", path.read_bytes())  # with its UV atlas
         else:
-            write_mesh(folder / "template.obj", mesh)
+            write_mesh(folder / "template.obj", Mesh(template.vertices.numpy(), template.faces.numpy()))
     else:
         problem = "expected a body beside the scans or body.path, there is none."
-        hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
-        raise DataError(source.path, problem, hint)
+        raise DataError(source.path, problem, source.body_hint)
     write_whole(folder / "outfit.yaml", yaml.safe_dump(settings, sort_keys=False).encode())
 
 

@@ -34,8 +34,8 @@ class FittedSource(Source):
     """An outfit of scans with SMPL-family parameters; body and scan have the same axes and, but for a unit, origin.
 
     The body is ``body.path`` in the shape of ``body.betas``, else of the layout's minimal T-pose mesh (`rest_path`),
-    else of the mean of the fits' own betas; `DataError` without a model or a shape. Raises `AvatarError` for another
-    ``up`` than y.
+    else of the mean of the fits' own betas; without ``body.path`` there is none, and scans are read without a pose.
+    Raises `AvatarError` for another ``up`` than y; `DataError` for a model whose shape nothing says.
     """
 
     kind: ClassVar[str] = "smpl"  # the model that was fitted
@@ -112,13 +112,16 @@ class FittedSource(Source):
         if not valid:
             raise errors[0] if errors else DataError(self.path, "expected scans, there are none.")
 
+    @property
+    def body_hint(self) -> str:
+        fitted = f"{self.gender} {self.kind}".strip()
+        return f"Hint: its fits pose a body of kind {fitted}. {way_to_file(self.kind)}, and give body.path=<file.npz>."
+
     @cached_property
-    def body(self) -> BodyModel:
+    def body(self) -> BodyModel | None:
         config = self.config.body
         if config.path is None:
-            gender = f"a {self.gender} " if self.gender else "a "
-            problem = f"expected {gender}body of kind {self.kind} that can be posed, body.path names none."
-            raise DataError(self.path, problem, f"Hint: {way_to_file(self.kind)}, and give body.path=<file.npz>.")
+            return None
         if config.path.suffix != ".npz" or holds_template(config.path):
             return body_of_file(config.path, {"canonical": config.canonical}, "body.")
         rest = None if config.betas else self.rest_path
@@ -138,20 +141,21 @@ class FittedSource(Source):
 
     def read(self, frame: SourceFrame) -> PosedScan:
         parameters, scan = self.parameters(frame), self.scan(frame)
-        body = self.body
-        if self.keeps_hands:
-            parameters = parameters.with_fingers(self.config.body.path)
-        with naming(frame.files[-1]):
-            pose = parameters.pose_of(body, cut=not self.keeps_hands)
         unit = self.config.units
         if unit == "auto":
             unit = self.unit_of(scan) if parameters.scale == 1 else "m"  # a fitted scale is all there is to the unit
+        pose = translation = vertices = None
+        if self.body is not None:
+            parameters = parameters.with_fingers(self.config.body.path) if self.keeps_hands else parameters
+            with naming(frame.files[-1]):
+                pose = parameters.pose_of(self.body, cut=not self.keeps_hands)
+            translation = parameters.translation.astype(np.float32)
+            vertices = self.vertices(frame) if self.keeps_hands else None
         moved = scan.vertices.astype(np.float64) * (METRES[unit] / parameters.scale)
-        vertices = self.vertices(frame) if self.keeps_hands else None
         return PosedScan(
             scan=replace(scan, vertices=moved.astype(np.float32)),
             pose=pose,
-            translation=parameters.translation.astype(np.float32),
+            translation=translation,
             vertices=None if vertices is None else vertices / np.float32(parameters.scale),
             labels=self.labels(frame),
         )

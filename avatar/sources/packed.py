@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.body.model import BodyModel
 from avatar.body.packed import holds_template
 from avatar.body.smpl import converted_kind
 from avatar.checks import DataError
 from avatar.data.folders import SPLITS
+from avatar.data.packed_layout import template_of_mesh
 from avatar.io.npz import naming, npz_keys, read_arrays
 from avatar.io.raw_surface import RawSurface
+from avatar.records import Template
 from avatar.sources.base import PosedScan, SourceFrame, numbered, outfits_at, sorted_frames, subfolders
 from avatar.sources.fitted import FittedSource, minimal_body, scan_of_arrays
 from avatar.sources.parameters import SmplParameters, parameters_of
@@ -70,15 +71,15 @@ class PackedSource(FittedSource):
         return converted_kind(path) == "smpl" if asked is None and not holds_template(path) else bool(asked)
 
     @property
-    def body(self) -> BodyModel | None:
-        return None if self.config.body.path is None else super().body
+    def body_hint(self) -> str:
+        place = self.path / "template.obj"
+        return f"Hint: put the minimal body's mesh in its T-pose there as {place}, or give body.path=."
 
-    @property
-    def rest_mesh(self) -> Path | None:
+    @cached_property
+    def mesh_template(self) -> Template | None:
         if self.rest_path is None or self.rest_path.suffix == ".npy":
-            hint = f"Hint: put the minimal body's mesh there as {self.path / 'template.obj'}, or give body.path=."
-            raise DataError(self.path, "expected a minimal body in its T-pose or body.path, there is neither.", hint)
-        return self.rest_path
+            return None
+        return template_of_mesh(self.rest_path)
 
     def parameters(self, frame: SourceFrame) -> SmplParameters:
         if len(frame.files) < 2:
