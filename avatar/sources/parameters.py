@@ -34,7 +34,7 @@ PARTS = {  # parts of a pose, the joints of each, and its keys
     "right hand": (FINGERS[15:], ("right_hand_pose",)),
     "hands": (FINGERS, ("pose_hand", "hand_pose")),
 }
-INNER, OUTER = ("transl", "trans"), ("translation",)  # of the body, and of what scale has made of it
+INNER, OUTER = ("transl",), ("translation", "trans")  # of the body, and of what scale has made of it
 BETAS = ("betas", "shape", "beta")
 KEYS = (*WHOLE, *ROOT, *BODY, *chain(*(keys for _, keys in PARTS.values())), *INNER, *OUTER, *BETAS, "scale")
 
@@ -82,8 +82,8 @@ def read_parameters(path: Path) -> SmplParameters:
 
     Poses are whole (66, 72, 156 or 165 numbers; ``pose``, ``poses``, ``fullpose``) or in parts (``global_orient`` and
     ``body_pose`` of 63 or 69, hands, jaw, eyes), flat or ``(J, 3)``, with an axis of one frame before them or not.
-    Hands may be principal components instead. ``transl`` and ``trans`` are scaled with the body, ``translation`` is
-    added behind ``scale``, as THuman's fits have it. Raises `DataError` naming the file and the key: missing, of
+    Hands may be principal components instead. ``transl`` is scaled with the body, ``translation`` or ``trans`` is
+    added behind ``scale``, as the fits of THuman and DeepFashion3D have it. Raises `DataError` naming the file and the key: missing, of
     several frames, matrices, degrees, not finite.
     """
     check_suffix(path, FORMATS, "body parameters")

@@ -63,10 +63,11 @@ def test_poses_are_read_under_their_keys(stored, count, suffix, tmp_path):
 
 @pytest.mark.parametrize("scale", [2.0, np.float32(2), np.array(2.0), np.array([2.0], np.float32)])
 def test_translation_is_added_behind_the_scale_and_transl_before(scale, tmp_path):
-    stored = {"pose": np.zeros(72), "transl": SHIFT, "translation": np.ones(3), "scale": scale}
-    found = write(tmp_path / "fit.pkl", stored)
-    np.testing.assert_allclose(found.translation, SHIFT + 0.5)
-    assert found.scale == 2
+    for key in ("translation", "trans"):
+        stored = {"pose": np.zeros(72), "transl": SHIFT, key: np.ones(3), "scale": scale}
+        found = write(tmp_path / "fit.pkl", stored)
+        np.testing.assert_allclose(found.translation, SHIFT + 0.5)
+        assert found.scale == 2
 
 
 def test_principal_components_of_hands_are_told_apart(tmp_path):
