@@ -83,8 +83,8 @@ def read_parameters(path: Path) -> SmplParameters:
     Poses are whole (66, 72, 156 or 165 numbers; ``pose``, ``poses``, ``fullpose``) or in parts (``global_orient`` and
     ``body_pose`` of 63 or 69, hands, jaw, eyes), flat or ``(J, 3)``, with an axis of one frame before them or not.
     Hands may be principal components instead. ``transl`` is scaled with the body, ``translation`` or ``trans`` is
-    added behind ``scale``, as the fits of THuman and DeepFashion3D have it. Raises `DataError` naming the file and the key: missing, of
-    several frames, matrices, degrees, not finite.
+    added behind ``scale``, as the fits of THuman and DeepFashion3D have it. Raises `DataError` naming the file and the
+    key: missing, of several frames, matrices, degrees, not finite.
     """
     check_suffix(path, FORMATS, "body parameters")
     return parameters_of(path, _read_keys(path))
