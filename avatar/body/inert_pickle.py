@@ -22,27 +22,27 @@ ENTRY_LIMIT = 10**8  # entries of a matrix that is stored sparse
 
 
 def read_pickled_arrays(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> dict[str, np.ndarray]:
-    """Named arrays of a pickled dictionary, such as an SMPL body model; other keys are never looked at.
+    """Named arrays of a pickled dictionary, such as an SMPL body model or a scan; other keys are never looked at.
 
-    Knows arrays of numpy, matrices of scipy.sparse and arrays of chumpy, as Python 2 or 3 wrote them. Raises
-    `DataError` for a missing, damaged, oversized or hostile file, missing ``required`` keys, or keys that hold no
-    numbers.
+    Knows arrays of numpy, matrices of scipy.sparse and arrays of chumpy, as Python 2 or 3 wrote them; plain text, such
+    as a gender, becomes an array of text. Raises `DataError` for a missing, damaged, oversized or hostile file, missing
+    ``required`` keys, or keys that hold neither.
     """
     required = tuple(required)
     if not path.is_file():
-        raise DataError(path, "expected a body-model file, there is none.")
+        raise DataError(path, "expected a pickle, there is none.")
     if path.stat().st_size > SIZE_LIMIT:
         raise DataError(path, f"expected at most {SIZE_LIMIT} bytes, got {path.stat().st_size}.")
     try:
         # from memory: a length that the file invents is then cut at its end, and never allocated
         stored = InertUnpickler(io.BytesIO(path.read_bytes()), encoding="latin1").load()
     except Exception as error:  # a damaged or hostile pickle can raise anything
-        raise DataError(path, f"expected a valid body-model pickle, reading failed: {error}.") from error
+        raise DataError(path, f"expected a valid pickle of arrays, reading failed: {error}.") from error
     if not isinstance(stored, dict):
         raise DataError(path, f"expected a pickled dictionary, got {type(stored).__name__}.")
     missing = [key for key in required if key not in stored]
     if missing:
-        raise DataError(path, f"expected a body model, it lacks {', '.join(missing)}.")
+        raise DataError(path, f"expected the keys {', '.join(required)}, it lacks {', '.join(missing)}.")
     arrays = {}
     for key in (key for key in (*required, *optional) if key in stored):
         try:
@@ -66,7 +66,9 @@ class Inert:
 
 
 def as_array(value: Any) -> np.ndarray:
-    """The numbers of a stand-in, or of a plain list."""
+    """The numbers of a stand-in, or of a plain list, or plain text."""
+    if isinstance(value, str):
+        return np.array(value)
     read = KNOWN[type(value).__name__][0] if isinstance(value, Inert) else np.asarray
     if read is None:
         raise AvatarError(f"{type(value).__name__} stands for no array")
@@ -87,9 +89,19 @@ def plain_dtype(dtype: Inert) -> np.dtype:
 def read_array(stored: Inert) -> np.ndarray:
     """An array of numpy, its bytes read as plain numbers."""
     _, shape, dtype, fortran, raw = stored.state
+    return np.frombuffer(plain_bytes(raw), plain_dtype(dtype)).reshape(shape, order="F" if fortran else "C")
+
+
+def plain_bytes(raw: Any) -> bytes:
+    """The bytes of an array or number."""
     raw = raw.arguments[0] if isinstance(raw, Inert) else raw  # of _codecs.encode, by which Python 3 writes old pickles
-    data = raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2 wrote bytes as text
-    return np.frombuffer(data, plain_dtype(dtype)).reshape(shape, order="F" if fortran else "C")
+    return raw.encode("latin1") if isinstance(raw, str) else raw  # Python 2 wrote bytes as text
+
+
+def read_scalar(stored: Inert) -> np.ndarray:
+    """One number of numpy, as an array without dimensions."""
+    dtype, raw = stored.arguments
+    return np.frombuffer(plain_bytes(raw), plain_dtype(dtype)).reshape(())
 
 
 def read_buffer(stored: Inert) -> np.ndarray:
@@ -135,7 +147,7 @@ KNOWN = {  # all that a pickle may name: what reads an object of that name, and 
     "Select": (read_selection, "chumpy.reordering"),
     "_reconstructor": (read_object, "copy_reg", "copyreg"),
     "dtype": (None, "numpy"),
-    "scalar": (None, *MULTIARRAY),
+    "scalar": (read_scalar, *MULTIARRAY),
     "object": (None, "__builtin__", "builtins"),
     "encode": (None, "_codecs"),
 }

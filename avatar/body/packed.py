@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,7 +16,7 @@ from avatar.body.skinning import blend_transforms, check_parents
 from avatar.checks import AvatarError, DataError, check_shape
 from avatar.geometry.transforms import invert_affine, invert_rigid, transform_points
 from avatar.io.meshes import read_obj_atlas
-from avatar.io.npz import read_arrays, write_arrays
+from avatar.io.npz import npz_keys, read_arrays, write_arrays
 from avatar.records import Template
 
 REQUIRED_KEYS = {"vertices": "float V 3", "faces": "int F 3", "parents": "int J", "joint_names": "text J"}
@@ -95,15 +94,18 @@ def joint_positions(vertices: np.ndarray, weights: np.ndarray, parents: tuple[in
     return joints.astype(vertices.dtype)
 
 
-def write_template(path: Path, template: Template, **others: np.ndarray) -> None:
-    """Writes a body at rest, and other arrays, as a ``template.npz``: weights without loss, and joint positions."""
+def write_template(path: Path, template: Template, level: int = 9, **others: np.ndarray) -> None:
+    """Writes a body at rest, and other arrays, as a ``template.npz``: weights without loss, and joint positions.
+
+    ``level`` of deflating as in `write_arrays`.
+    """
     ids, values = sparse_weights(template.weights.cpu().numpy())
     given = {name: getattr(template, name) for name in ("canonical_from_bind", "uv", "uv_faces", "vertices", "faces")}
     arrays = {name: value.cpu().numpy() for name, value in given.items() if value is not None}
     arrays |= {name: arrays[name].astype(np.int32) for name in ("uv_faces", "faces") if name in arrays}
     arrays |= {"weight_joints": ids, "weight_values": values, "joints": template.joints.cpu().numpy()}
     arrays |= {"parents": np.array(template.parents, np.int32), "joint_names": np.array(template.joint_names)}
-    write_arrays(path, arrays | others)
+    write_arrays(path, arrays | others, level)
 
 
 def read_template(path: Path) -> Template:
@@ -115,15 +117,16 @@ def read_template(path: Path) -> Template:
         return replace(template, canonical_from_bind=float32_tensor(arrays.get("canonical_from_bind")))
 
 
-def write_body(path: Path, body: BodyModel) -> None:
+def write_body(path: Path, body: BodyModel, level: int = 9) -> None:
     """Writes a body as a ``template.npz`` that `packed_body` poses exactly as it was.
 
-    Beside the T-pose it keeps the pose in which the skinning weights were painted, and pose blendshapes.
+    Beside the T-pose it keeps the pose in which the skinning weights were painted, and pose blendshapes; ``level`` of
+    deflating as in `write_arrays`.
     """
     at_rest = body.with_canonical_pose(torch.zeros_like(body.canonical_pose)).template
     kept = {key: getattr(body, key) for key in (*BIND_KEYS, "pose_directions")}
     arrays = {key: value.cpu().numpy() for key, value in kept.items() if value is not None}
-    write_template(path, at_rest, **arrays)
+    write_template(path, at_rest, level, **arrays)
 
 
 def packed_body(path: Path) -> BodyModel:
@@ -163,11 +166,7 @@ def data_errors(path: Path, hint: str = "") -> Iterator[None]:
 
 def holds_template(path: Path) -> bool:
     """Whether a file looks like a ``template.npz``, valid or not."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {"vertices.npy", "parents.npy"} <= set(archive.namelist())
-    except (zipfile.BadZipFile, OSError):
-        return False
+    return {"vertices", "parents"} <= npz_keys(path)
 
 
 def add_atlas(source: Path, target: Path, uv: Path) -> None:

@@ -33,6 +33,7 @@ REQUIRED_KEYS = {
     **{"faces": "int F 3", "kind": "text 1", "parents": "int J", "joint_names": "text J"},
 }
 OPTIONAL_KEYS = {"posedirs": "float V 3 P", "uv": "float U 2", "uv_faces": "int F 3"}
+HAND_KEYS = {"hand_means": "float 2 45", "hand_components": "float 2 45 45"}  # left, right
 
 
 def _hands(first: int) -> dict[str, int]:
@@ -65,20 +66,24 @@ def smpl_body(
     all_joints: bool = False,
     canonical_pose: Tensor | None = None,
     kind: str | None = None,
+    vertices: np.ndarray | None = None,
 ) -> BodyModel:
     """A body of the SMPL family from a file of tools/convert_body.py, float32, with pose blendshapes where it has them.
 
     Shape coefficients ``betas`` are standard deviations, at most as many as the file has. Without ``all_joints`` the
     skinning weights of hands and face go to wrists and head: exactly the model with fingers and face in their zero
-    pose. ``kind`` is what the file must hold (smpl, smplh, smplx), any if None. Raises `DataError` for a missing or
-    damaged file or one of another kind, with the way to a good one; `AvatarError` for too many betas.
+    pose. ``kind`` is what the file must hold (smpl, smplh, smplx), any if None. ``vertices (V, 3)``, metres, are this
+    person's own body in the T-pose, in place of the shape of ``betas``: its joints follow from the file's regressor.
+    Raises `DataError` for a missing or damaged file or one of another kind, with the way to a good one; `AvatarError`
+    for too many betas or another number of vertices.
     """
     model = _read_model(path, kind)
     components = model["shapedirs"].shape[-1]
     if len(betas) > components:
         raise AvatarError(f"betas: expected at most {components} numbers for {path}, got {len(betas)}.")
-    shape = model["shapedirs"][..., : len(betas)] @ np.asarray(betas, np.float64)
-    vertices = model["v_template"] + shape
+    if vertices is None:
+        vertices = model["v_template"] + model["shapedirs"][..., : len(betas)] @ np.asarray(betas, np.float64)
+    check_shape("vertices", vertices, "V 3", V=len(model["v_template"]))
     joints, weights, posedirs = model["J_regressor"] @ vertices, model["weights"], model.get("posedirs")
     parents, names = model["parents"], model["joint_names"]
     if not all_joints:
@@ -106,6 +111,20 @@ def merge_weights(weights: np.ndarray, parents: Sequence[int], count: int) -> np
     for joint in range(len(parents) - 1, count - 1, -1):
         merged[:, parents[joint]] += merged[:, joint]
     return merged[:, :count]
+
+
+def hand_rotations(path: Path, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Rotations of the finger joints ``(30, 3)``, left before right, of principal components ``(C,)`` of each hand.
+
+    As smplx reads them: the model's mean hand and the sum of its first C components. Raises `DataError` for a converted
+    model without components, which only SMPL-H and SMPL-X files have.
+    """
+    stored = read_arrays(path, {}, HAND_KEYS)
+    if len(stored) < len(HAND_KEYS):
+        hint = "Hint: convert the SMPL-X or SMPL-H file again; earlier conversions left them out."
+        raise DataError(path, "expected principal components of hands, there are none.", hint)
+    sides = zip((left, right), stored["hand_means"], stored["hand_components"])
+    return np.concatenate([mean + values @ parts[: len(values)] for values, mean, parts in sides]).reshape(30, 3)
 
 
 def way_to_file(kind: str, path: Path | None = None) -> str:
@@ -140,6 +159,10 @@ SHAPE_COMPONENTS = {20: 10, 400: 300}  # SMPL-X stores expression blendshapes be
 SOURCE_KEYS = {key: f"number {shape}" for key, shape in MODEL_SHAPES.items()}
 SOURCE_KEYS |= {"f": "int F 3", "kintree_table": "int 2 J"}
 OPTIONAL_SOURCE_KEYS = {"posedirs": "number V 3 P", "vt": "number U 2", "ft": "number F 3"}  # vt, ft: an atlas
+SOURCE_HANDS = {
+    f"hands_{key}{side}": f"number {shape}" for key, shape in (("mean", "45"), ("components", "45 45")) for side in "lr"
+}
+OPTIONAL_SOURCE_KEYS |= SOURCE_HANDS
 
 
 def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> str:
@@ -192,6 +215,10 @@ def _plain_model(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     for key, array in plain.items():
         check_finite(key, array)
     plain["faces"] = arrays["f"].astype(np.int32)
+    if SOURCE_HANDS.keys() <= arrays.keys():
+        for key, parts in zip(HAND_KEYS, ("hands_meanl hands_meanr", "hands_componentsl hands_componentsr")):
+            plain[key] = np.stack([arrays[part].astype(np.float32) for part in parts.split()])
+            check_finite(key, plain[key])
     if "vt" in arrays and "ft" in arrays:
         if not np.array_equal(arrays["ft"], np.rint(arrays["ft"])):  # some files keep whole numbers as floats
             raise AvatarError("ft: expected whole numbers, got others.")

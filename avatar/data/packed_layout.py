@@ -103,7 +103,7 @@ class PackedOutfit(Outfit):
             return body_of_file(*self._bodies[key], f"{key}.")
 
     def _read_template(self) -> Template:
-        return self.body.template if self.body else _template_of_mesh(self.path / "template.obj")
+        return self.body.template if self.body else template_of_mesh(self.path / "template.obj")
 
     def _read_frame(self, path: Path, split: str, name: str) -> Frame:
         return self.frame_of(read_arrays(path, REQUIRED, OPTIONAL), path, split, name)
@@ -258,15 +258,15 @@ def _stored_pose(pose: np.ndarray, joint_names: Sequence[str], path: Path) -> np
     return pose
 
 
-def _template_of_mesh(path: Path) -> Template:
-    """A body that is only a mesh, with its UV atlas if it has one: everything hangs on one root joint at the origin."""
+def template_of_mesh(path: Path) -> Template:
+    """A body that is only a mesh, with an OBJ's UV atlas if it has one: everything hangs on one root at the origin."""
     if not path.is_file():
         problem = "expected template.npz or template.obj (the minimal body in its T-pose), there is neither."
         target = shlex.quote(str(path.with_suffix(".npz")))
         hint = f"Make one: python tools/convert_body.py <downloaded SMPL file> {target}"
         raise DataError(path.parent, problem, hint)
     mesh = read_mesh(path)
-    atlas = read_obj_atlas(path, mesh.faces, len(mesh.vertices))
+    atlas = read_obj_atlas(path, mesh.faces, len(mesh.vertices)) if path.suffix == ".obj" else None
     return Template(
         vertices=torch.from_numpy(mesh.vertices),
         faces=torch.from_numpy(mesh.faces),

@@ -10,11 +10,11 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
-from avatar.checks import AvatarError, DataError, check_finite, check_shape
+from avatar.checks import AvatarError, DataError, check_file, check_finite, check_shape
 
 SIZE_LIMIT = 4 << 30  # bytes of arrays in one file, unpacked
 MEMBER_LIMIT = 200
@@ -73,6 +73,23 @@ def read_arrays(
         raise DataError(path, f"expected a valid npz file, reading failed: {error}.", hint) from error
 
 
+def npz_keys(path: Path) -> set[str]:
+    """The keys of an npz file, unread; none of what is no such file."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {name.removesuffix(".npy") for name in archive.namelist()}
+    except (*DAMAGED, ValueError):
+        return set()
+
+
+def read_npy(path: Path, description: str, limit: int = SIZE_LIMIT) -> np.ndarray:
+    """The array of an npy file, whose kind and shape are described and checked as those of `read_arrays`."""
+    kind, _, pattern = description.partition(" ")
+    check_file(path, limit)
+    with path.open("rb") as stream:
+        return _read_stream(path, stream, path.stat().st_size, path.name, kind, pattern, {})
+
+
 def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipfile.ZipInfo]:
     """Array members by key, after the checks that need no reading."""
     infos = archive.infolist()
@@ -92,12 +109,17 @@ def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipf
 def _read(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, key: str, description: str, dims: dict) -> Any:
     """One member as an array; ``dims`` holds the named sizes from key to key."""
     kind, _, pattern = description.partition(" ")
+    with archive.open(info) as stream:
+        return _read_stream(path, stream, info.file_size, key, kind, pattern, dims)
+
+
+def _read_stream(path: Path, stream: IO[bytes], size: int, key: str, kind: str, pattern: str, dims: dict) -> np.ndarray:
+    """The array that a stream of ``size`` bytes holds in numpy's format, checked."""
     try:
-        with archive.open(info) as stream:
-            shape, fortran, dtype = READERS[np.lib.format.read_magic(stream)](stream)
-            _check_header(path, key, shape, dtype, kind, info.file_size - stream.tell())
-            array = np.frombuffer(bytearray(stream.read()), dtype=dtype)
-            array = array.reshape(shape, order="F" if fortran else "C")
+        shape, fortran, dtype = READERS[np.lib.format.read_magic(stream)](stream)
+        _check_header(path, key, shape, dtype, kind, size - stream.tell())
+        array = np.frombuffer(bytearray(stream.read()), dtype=dtype)
+        array = array.reshape(shape, order="F" if fortran else "C")
     except (*DAMAGED, DataError, MemoryError):
         raise
     except Exception as error:  # numpy takes an array's header for Python and may raise what Python does

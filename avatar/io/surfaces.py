@@ -46,6 +46,13 @@ def read_surface(path: str | Path) -> RawSurface:
     check_file(path, MAX_BYTES)
     with np.errstate(all="ignore"):  # what overflows is reported as not finite
         surface = READERS[suffix](path, path.read_bytes())
+    return check_surface(surface)
+
+
+def check_surface(surface: RawSurface) -> RawSurface:
+    """The surface with float32 vertices and unit normals. Raises `DataError` for an invalid one as `read_surface`."""
+    path = surface.path
+    with np.errstate(all="ignore"):
         surface = replace(surface, vertices=np.asarray(surface.vertices).astype(np.float32))
     if not len(surface.vertices):
         raise DataError(path, "expected triangles or points, got no vertices.", "Hint: export the mesh itself.")

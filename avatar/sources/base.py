@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,8 +13,9 @@ from typing import ClassVar
 import numpy as np
 
 from avatar.body.model import BodyModel
-from avatar.checks import unknown_name
+from avatar.checks import DataError, plain_name, unknown_name
 from avatar.geometry.units import METRES
+from avatar.invocation import command_line, option
 from avatar.io.raw_surface import RawSurface
 from avatar.records import Template
 
@@ -25,7 +28,7 @@ class SourceBody:
 
     path: Path | None = None  # a converted SMPL, SMPL-H or SMPL-X model, a template.npz, or a rigged GLB
     betas: list[float] = field(default_factory=list)  # shape, standard deviations; those beside the scans if empty
-    all_joints: bool = False  # false: hands and face at rest, 22 joints
+    all_joints: bool | None = None  # true keeps hands and face, false lays them at rest (22 joints); null: as poses do
     canonical: str = "t"  # t, or apart (hips 25 degrees outwards, for skirts)
 
 
@@ -88,6 +91,41 @@ class PosedScan:
         return any(part is not None for part in parts)
 
 
+def sorted_frames(path: Path, frames: Iterable[SourceFrame]) -> tuple[SourceFrame, ...]:
+    """Frames by split, sequence and number; `DataError` where two have one name."""
+    found = sorted(frames, key=lambda frame: (frame.split, frame.sequence, frame.number, frame.name))
+    seen: dict[tuple[str, str], SourceFrame] = {}
+    for frame in found:
+        other = seen.setdefault((frame.split, frame.name), frame)
+        if other is not frame:
+            problem = f"expected every frame once, {other.files[0]} and {frame.files[0]} are both called {frame.name}."
+            raise DataError(path, problem, "Hint: rename one.")
+    return tuple(found)
+
+
+def numbered(stem: str) -> tuple[str, int]:
+    """Sequence and number that a file's name without its ending holds; number -1 where it ends in no digits."""
+    match = re.fullmatch(r"(.*?)[._-]?f?(\d{1,12})", stem)
+    return (match[1], int(match[2])) if match else (stem, -1)
+
+
+def subfolders(path: Path) -> list[Path]:
+    """The visible folders in a folder, sorted; none of what is no folder."""
+    if not path.is_dir():
+        return []
+    return sorted(folder for folder in path.iterdir() if folder.is_dir() and not folder.name.startswith("."))
+
+
+def outfits_at(folders: Iterable[Path]) -> dict[str, Path]:
+    """Outfits by plain names from their folders; `DataError` where two have one name."""
+    found: dict[str, Path] = {}
+    for folder in folders:
+        name = plain_name(folder.resolve().name, "outfit")
+        if found.setdefault(name, folder) != folder:
+            raise DataError(folder, f"expected every outfit once, {found[name]} has the name {name} too.")
+    return found
+
+
 class Source(ABC):
     """One outfit of a data set in a foreign layout; nothing of it is ever written to.
 
@@ -96,9 +134,17 @@ class Source(ABC):
     """
 
     layout: ClassVar[str]
+    expected: ClassVar[str] = ""  # the files of the layout, a tree of a few lines
+    home: ClassVar[str] = ""  # where data of this layout are to be had
 
     def __init__(self, path: Path, name: str, config: SourceConfig):
         self.path, self.name, self.config = Path(path), name, config
+
+    @classmethod
+    def missing(cls, path: Path, problem: str) -> DataError:
+        """The error of files that are not there: the layout that is expected, and where such data are to be had."""
+        home = f"\nTo be had at {cls.home}." if cls.home else ""
+        return DataError(path, problem, f"Hint: layout {cls.layout} has\n{cls.expected}{home}")
 
     @classmethod
     @abstractmethod
@@ -123,6 +169,11 @@ class Source(ABC):
     def mean_body(self) -> BodyModel | None:
         """The body of mean shape that pose encoders see; the subject's own where the layout has no other."""
         return self.body
+
+    @property
+    def body_hint(self) -> str:
+        """How the outfit gets a body, where it has none."""
+        return f"Hint: fit one: {command_line('data_fit', option('source', self.path))}"
 
     @property
     def mesh_template(self) -> Template | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 from dataclasses import dataclass, replace
@@ -20,7 +21,6 @@ from avatar.checks import AvatarError, DataError, check_name, check_range
 from avatar.data.folders import OUTFIT_FORMAT, SPLITS
 from avatar.data.packed_layout import BODY, BODY_FILES, MEAN, PackedOutfit
 from avatar.geometry.surface import interpolate, sample_surface
-from avatar.invocation import command_line, option
 from avatar.io.documents import read_json
 from avatar.io.frames import write_manifest
 from avatar.io.ledger import Ledger, digest_of, file_digest, keyed
@@ -34,11 +34,13 @@ from avatar.records import Frame, Mesh, Template
 from avatar.settings import settings_to_dict
 from avatar.sources.base import PosedScan, Source, SourceConfig, SourceFrame
 from avatar.sources.normals import oriented_normals
+from avatar.sources.published import split_frames
 
 SOURCE = ("avatar.sources.conversion",)
 PROVENANCE = "source.json"
 FIT_KEYS = {"pose": "pose", "translation": "translation", "body_verts": "vertices", "vtransf": "vertex_transforms"}
 FIT_KEYS |= {key: key for key in ("joint_transforms", "pose_vertices")}
+FAST = 1  # level of deflating: a few percent larger than level 9, in a tenth of the time
 log = logging.getLogger(__name__)
 
 
@@ -50,6 +52,7 @@ class ConvertConfig(SourceConfig):
     dataset: str = "mine"  # the folder below data_root that outfits are written to
     name: str = ""  # of the outfit, where the source has one; that of its folder if empty
     test: float = 0.2  # share of frames that become the test split where there is none, the last of each sequence
+    split: str = ""  # of a paper, where the layout has none: cape, scanimate or 4d-dress, in place of test
     start: int = 0  # first frame of each sequence
     stop: int | None = None  # the frame behind the last one; all of them if null
     step: int = 1  # every which frame is taken
@@ -79,14 +82,14 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
     outfit = SourceOutfit(source, config)
     with lock_folder(folder.parent / ".locks" / folder.name):
         _claim(folder, source)
-        write_body_files(folder, source)
         ledger, failed = Ledger(folder), {}
+        write_body_files(folder, source, ledger)
         settings = {key: getattr(config, key) for key in ("units", "up", "points")}
         bodies = {path.name: file_digest(path) for path in (*folder.glob("*.npz"), *folder.glob("*.obj"))}
         for frame in tracked(outfit.chosen, f"convert {source.name}"):
             path, label = folder / frame.split / f"{frame.name}.npz", f"{frame.split}/{frame.name}"
             files = [file_digest(file) for file in frame.files]
-            key = keyed(SOURCE, files=files, bodies=bodies, settings=settings)
+            key = keyed((*SOURCE, type(source).__module__), files=files, bodies=bodies, settings=settings)
             if ledger.find(label, key) is not None:
                 continue
             try:
@@ -97,7 +100,7 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
                 failed[label] = str(error)
                 continue
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_arrays(path, outfit.arrays)
+            write_arrays(path, outfit.arrays, FAST)
             ledger.record(label, key, [path])
         if len(failed) == len(outfit.chosen):
             problem = f"expected valid frames, all {len(failed)} are invalid. The first: {next(iter(failed.values()))}"
@@ -120,7 +123,7 @@ class SourceOutfit(PackedOutfit):
     def __init__(self, source: Source, config: ConvertConfig):
         super().__init__(source.path, config.dataset)
         self.name, self.source, self.points = config.name or source.name, source, config.points
-        self.chosen = chosen_frames(source.frames, config)
+        self.chosen = chosen_frames(source, config)
         if not self.chosen:
             raise DataError(source.path, f"expected frames of {source.name}, start, stop and step leave none.")
         self.arrays: dict[str, np.ndarray] = {}
@@ -155,12 +158,17 @@ class SourceOutfit(PackedOutfit):
         return self.frame_of(dict(self.arrays), path, split, name)
 
 
-def chosen_frames(frames: tuple[SourceFrame, ...], config: ConvertConfig) -> list[SourceFrame]:
+def chosen_frames(source: Source, config: ConvertConfig) -> list[SourceFrame]:
     """The frames that are converted, each with its split: the layout's own, or the last of each sequence for testing.
 
-    Single scans are one sequence, in the order of their names. At least one frame is left to train on.
+    Single scans are one sequence, in the order of their names. At least one frame is left to train on. Raises
+    `AvatarError` as `split_frames` for the split of a paper, and for one where the layout has its own.
     """
-    chosen = []
+    frames, chosen = source.frames, []
+    if config.split:
+        if any(frame.split for frame in frames):
+            raise AvatarError(f"split: expected none, as layout {source.layout} has its own, got {config.split}.")
+        frames = split_frames(frames, source.name, config.split)
     for _, group in groupby(frames, key=lambda frame: (frame.split, frame.sequence)):
         taken = list(group)[config.start : config.stop : config.step]
         tested = min(round(config.test * len(taken)), len(taken) - 1)
@@ -175,8 +183,7 @@ def packed_arrays(source: Source, frame: SourceFrame, points: int | None) -> dic
     posed = source.read(frame)
     if not posed.fitted:
         problem = "expected a fitted body, nothing beside the scan says how it lies."
-        hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
-        raise DataError(frame.files[0], problem, hint)
+        raise DataError(frame.files[0], problem, source.body_hint)
     arrays = {key: getattr(posed, name) for key, name in FIT_KEYS.items()}
     arrays |= scan_arrays(posed, posed_vertices(source, posed), points, frame.name)
     arrays["scan_name"] = np.array(frame.name)
@@ -232,23 +239,38 @@ def posed_vertices(source: Source, posed: PosedScan) -> np.ndarray | None:
         return source.body(pose, shift).vertices[0].numpy()
 
 
-def write_body_files(folder: Path, source: Source) -> None:
-    """Writes the body at rest, the mean one and ``outfit.yaml``; `DataError` where the source has no body at all."""
+def write_body_files(folder: Path, source: Source, ledger: Ledger) -> None:
+    """Writes the body at rest, the mean one and ``outfit.yaml``; `DataError` where the source has no body at all.
+
+    A body that is there already is not written again: the blendshapes of SMPL-X take seconds to deflate.
+    """
     settings: dict = {"format": OUTFIT_FORMAT, "layout": "packed", "source": f"{source.layout}: {source.name}"}
     if source.body is not None:
         bodies = {BODY: source.body} | ({} if source.mean_body is source.body else {MEAN: source.mean_body})
         for key, body in bodies.items():
-            write_body(folder / BODY_FILES[key], body)
+            path, digest = folder / BODY_FILES[key], keyed(SOURCE, body=body_digest(body))
+            if ledger.find(key, digest) is None:
+                write_body(path, body, FAST)
+                ledger.record(key, digest, [path])
             settings[key] = {"canonical": canonical_name(body)}
-    elif source.mesh_template is not None:
-        template = source.mesh_template
-        mesh = Mesh(template.vertices.numpy(), template.faces.numpy())
-        write_mesh(folder / "template.obj", mesh)
+    elif (template := source.mesh_template) is not None:
+        path = source.body_files[-1]
+        if path.suffix == ".obj":
+            write_whole(folder / "template.obj", path.read_bytes())  # with its UV atlas
+        else:
+            write_mesh(folder / "template.obj", Mesh(template.vertices.numpy(), template.faces.numpy()))
     else:
         problem = "expected a body beside the scans or body.path, there is none."
-        hint = f"Hint: fit one: {command_line('data_fit', option('source', source.path))}"
-        raise DataError(source.path, problem, hint)
+        raise DataError(source.path, problem, source.body_hint)
     write_whole(folder / "outfit.yaml", yaml.safe_dump(settings, sort_keys=False).encode())
+
+
+def body_digest(body: BodyModel) -> str:
+    """One hash over all that a body is made of."""
+    found = hashlib.sha256(repr((body.parents, body.joint_names)).encode())
+    for name, buffer in body.named_buffers():
+        found.update(name.encode() + buffer.numpy().tobytes())
+    return found.hexdigest()
 
 
 def _claim(folder: Path, source: Source) -> None:

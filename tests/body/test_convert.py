@@ -18,6 +18,7 @@ import scipy.sparse
 import torch
 from bodies import distinct, random_model, write_unwrapped
 
+from avatar.body.inert_pickle import read_pickled_arrays
 from avatar.body.open import open_body
 from avatar.body.packed import packed_body, write_template
 from avatar.body.smpl import convert_body_model, joint_tree, smpl_body
@@ -99,6 +100,19 @@ def test_pickles_as_smpl_has_them(compress, protocol, chumpy, tmp_path):
     (tmp_path / "model.pkl").write_bytes(pickle.dumps(stored, protocol=protocol))
     convert_body_model(tmp_path / "model.pkl", tmp_path / "plain.npz")
     check_faithful(tmp_path / "plain.npz", "smpl", model)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_numbers_and_text_beside_arrays_are_read(protocol, tmp_path):
+    stored = {"scale": np.float32(0.8), "count": 3, "gender": "female", "names": ["a", "b"], "big": np.float64(2)}
+    (tmp_path / "fit.pkl").write_bytes(pickle.dumps(stored, protocol=protocol))
+    found = read_pickled_arrays(tmp_path / "fit.pkl", ("scale",), ("count", "gender", "big", "none"))
+    assert {key: value.item() for key, value in found.items()} == {key: stored[key] for key in found}
+    assert found["scale"].dtype == np.float32 and set(found) == {"scale", "count", "gender", "big"}
+    with pytest.raises(DataError, match="names: expected an array of numbers"):
+        read_pickled_arrays(tmp_path / "fit.pkl", ("names",))
+    with pytest.raises(DataError, match="expected the keys scale, pose, it lacks pose"):
+        read_pickled_arrays(tmp_path / "fit.pkl", ("scale", "pose"))
 
 
 def test_pickles_of_python_2(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from avatar.checks import AvatarError, DataError
-from avatar.io.npz import read_arrays, write_arrays, write_whole
+from avatar.io.npz import npz_keys, read_arrays, read_npy, write_arrays, write_whole
 
 KEYS = {"points": "float N 3", "labels": "uint8 N"}
 
@@ -173,3 +173,28 @@ def test_objects_are_not_written(tmp_path):
     with pytest.raises(AvatarError, match="a: expected numbers or text"):
         write_arrays(tmp_path / "a.npz", {"a": np.array([None])})
     assert not (tmp_path / "a.npz").exists()
+
+
+def test_keys_are_listed_without_reading(tmp_path, arrays):
+    write_arrays(tmp_path / "a.npz", arrays)
+    assert npz_keys(tmp_path / "a.npz") == set(arrays)
+    (tmp_path / "b.npz").write_bytes(b"not a zip")
+    assert npz_keys(tmp_path / "b.npz") == npz_keys(tmp_path / "none.npz") == set()
+
+
+def test_one_array_is_read_as_those_of_an_npz(tmp_path, arrays):
+    path = tmp_path / "a.npy"
+    np.save(path, np.asfortranarray(arrays["points"]))
+    np.testing.assert_array_equal(read_npy(path, "float V 3"), arrays["points"])
+    whole = path.read_bytes()
+    for data, message in (
+        (whole[:-1], "its header declares 120 bytes"),
+        (b"", "at least 1 bytes"),
+        (b"\x93NUM", r"a\.npy"),
+        (npy(np.array([{}, None]), allow_pickle=True), "Python objects"),
+        (npy(np.full((2, 3), np.inf)), "expected finite"),
+        (npy(np.zeros((2, 2))), "expected shape"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(DataError, match=message):
+            read_npy(path, "float V 3")
