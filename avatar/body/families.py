@@ -27,6 +27,7 @@ from avatar.records import Template
 
 PHENOTYPE_MEAN = {"gender": 0.5, "age": 2 / 3, "muscle": 0.5, "weight": 0.5, "height": 0.5, "proportions": 0.5}
 PHENOTYPE_STD = {"gender": 0.5, "age": 0.05, "muscle": 0.2, "weight": 0.2, "height": 0.25, "proportions": 0.2}
+OLDEST = 2 / 3  # an adult; beyond, people shrink again, so that two ages would fit one height
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def anny_family() -> BodyFamily:
         mean=mean,
         std=torch.tensor([PHENOTYPE_STD[name] for name in model.phenotype_labels]),
         low=torch.zeros(len(mean)),
-        high=torch.ones(len(mean)),
+        high=torch.tensor([OLDEST if name == "age" else 1.0 for name in model.phenotype_labels]),
         bind=bind,
         directions=directions,
         joint_directions=joint_directions,

@@ -34,6 +34,15 @@ def join_fits(fits: Sequence[Fit]) -> Fit:
     return Fit(*(torch.cat([getattr(fit, name) for fit in fits]) for name in ("pose", "translation", "shape")))
 
 
+def where(better: Tensor, first: Fit, second: Fit) -> Fit:
+    """The first fits where a condition ``(B,)`` holds, and the second elsewhere."""
+    return Fit(
+        torch.where(better[:, None, None], first.pose, second.pose),
+        torch.where(better[:, None], first.translation, second.translation),
+        torch.where(better[:, None], first.shape, second.shape),
+    )
+
+
 @dataclass
 class Bones:
     """Rigid motions posed_from_bind of the joints: rotations ``(B, J, 3, 3)``, places ``(B, J, 3)`` and shifts."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avatar.body.families import BodyFamily
 from avatar.body.model import SMPL_JOINTS
-from avatar.fitting.posing import Fit, PosedFamily, joint_descendants, left_jacobian
+from avatar.fitting.posing import Fit, PosedFamily, joint_descendants, left_jacobian, skin, where
 from avatar.fitting.prior import drawn_prior
 from avatar.fitting.settings import FittingConfig, StageConfig
 from avatar.geometry.surface import farthest_points
@@ -118,8 +118,6 @@ class Registration:
         config = self.config
         weights = self.family.bind.weights[pairs.ids]
         rest = torch.gather(posed.rest, 1, pairs.ids.unsqueeze(-1).expand(-1, -1, 3))
-        from avatar.fitting.posing import skin
-
         offsets = pairs.targets - skin(weights, posed.bones, rest)
         across = (offsets * pairs.normals).sum(dim=-1)
         squared = (1 - config.tangential) * across.square() + config.tangential * offsets.square().sum(dim=-1)
@@ -184,13 +182,38 @@ class Registration:
                 hessian[:, outer, outer] += config.shape_weight * torch.diag(self.family.std**-2)
                 gradient[:, outer] += config.shape_weight * off / self.family.std
 
-    def step(self, fit: Fit, which: list[int], stage: StageConfig, with_shape: bool = True) -> tuple[Fit, Tensor]:
-        """One Gauss-Newton step of every fit, and the objectives before it."""
-        config = self.config
-        hessian, gradient, objective = self.normal_equations(fit, which, stage, with_shape)
-        hessian = hessian + config.damping * torch.eye(hessian.shape[1])
-        change = torch.linalg.solve(hessian.double(), gradient.double()).float()
-        return self.moved(fit, change, with_shape), objective
+    def run(self, fit: Fit, which: list[int], stage: StageConfig, with_shape: bool = True) -> tuple[Fit, Tensor]:
+        """The fits after the steps of a stage, and their objectives.
+
+        Correspondences are new in each step, so a step may raise the objective (as in any iterative closest point
+        method); damping keeps it short.
+        """
+        for _ in range(stage.steps):
+            hessian, gradient, _ = self.normal_equations(fit, which, stage, with_shape)
+            damped = hessian + self.config.damping * torch.eye(hessian.shape[1])
+            fit = self.moved(fit, self.solve(fit, damped, gradient, with_shape), with_shape)
+        return fit, self.normal_equations(fit, which, stage, with_shape=False)[2]
+
+    def solve(self, fit: Fit, hessian: Tensor, gradient: Tensor, with_shape: bool) -> Tensor:
+        """Changes ``(B, P)`` that minimise the quadratic models with the shapes within their bounds.
+
+        Shape numbers that would leave their bounds stop there, and the others are solved for again.
+        """
+        hessian, gradient = hessian.double(), gradient.double()
+        change = torch.linalg.solve(hessian, gradient)
+        if not with_shape or not self.family.names:
+            return change.float()
+        outer = slice(hessian.shape[1] - len(self.family.names), None)
+        wanted = fit.shape + change[:, outer]
+        held = torch.zeros_like(gradient)
+        held[:, outer] = (wanted.clamp(self.family.low, self.family.high) != wanted).double()
+        fixed = torch.zeros_like(gradient)
+        fixed[:, outer] = wanted.clamp(self.family.low, self.family.high) - fit.shape
+        fixed = fixed * held
+        free = 1 - held
+        rest = gradient - (hessian @ fixed.unsqueeze(-1)).squeeze(-1)
+        reduced = hessian * free.unsqueeze(1) * free.unsqueeze(2) + torch.diag_embed(held)
+        return (torch.linalg.solve(reduced, rest * free) + fixed).float()
 
     def moved(self, fit: Fit, change: Tensor, with_shape: bool) -> Fit:
         """Fits after a change ``(B, P)``, too long ones shortened, shapes within their bounds."""
