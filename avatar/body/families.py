@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from pathlib import Path
 
 import torch
@@ -27,6 +27,7 @@ from avatar.records import Template
 
 PHENOTYPE_MEAN = {"gender": 0.5, "age": 2 / 3, "muscle": 0.5, "weight": 0.5, "height": 0.5, "proportions": 0.5}
 PHENOTYPE_STD = {"gender": 0.5, "age": 0.05, "muscle": 0.2, "weight": 0.2, "height": 0.25, "proportions": 0.2}
+NO_FACES = torch.zeros(0, 3, dtype=torch.long)
 OLDEST = 2 / 3  # an adult; beyond, people shrink again, so that two ages would fit one height
 
 
@@ -54,14 +55,14 @@ class BodyFamily:
     make: Callable[[Tensor], BodyModel]
     pose_directions: Tensor | None = None
 
-    def rest(self, shape: Tensor, ids: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
-        """Bind vertices ``(B, N, 3)``, all or those of some ``ids``, and joints ``(B, J, 3)`` of shapes ``(B, K)``.
+    def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """Bind vertices ``(B, V, 3)`` and joints ``(B, J, 3)`` of shapes ``(B, K)``.
 
         Differentiable in the shape. Raises `AvatarError` for another number of parameters.
         """
         check_shape("shape", shape, "B K", K=len(self.names))
         values = self.coefficients(shape)
-        vertices = torch.einsum("bc,cvx->bvx", values, self.directions[:, ids]) + self.bind.vertices[ids]
+        vertices = torch.einsum("bc,cvx->bvx", values, self.directions) + self.bind.vertices
         return vertices, torch.einsum("bc,cjx->bjx", values, self.joint_directions) + self.bind.joints
 
     def body(self, shape: Tensor) -> BodyModel:
@@ -69,7 +70,13 @@ class BodyFamily:
         check_shape("shape", shape, "K", K=len(self.names))
         return self.make(shape)
 
-    @property
+    def at(self, ids: Tensor) -> BodyFamily:
+        """The same bodies with some vertices ``(N,)`` only, in this order, and no faces."""
+        bind = replace(self.bind, vertices=self.bind.vertices[ids], weights=self.bind.weights[ids], faces=NO_FACES)
+        poses = None if self.pose_directions is None else self.pose_directions[ids]
+        return replace(self, bind=bind, directions=self.directions[:, ids], pose_directions=poses)
+
+    @cached_property
     def normals(self) -> Tensor:
         """Unit normals ``(V, 3)`` of the mean shape's bind vertices."""
         return vertex_normals(self.rest(self.mean[None])[0][0], self.bind.faces)

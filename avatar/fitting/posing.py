@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -32,15 +33,6 @@ class Fit:
 def join_fits(fits: Sequence[Fit]) -> Fit:
     """One batch of several."""
     return Fit(*(torch.cat([getattr(fit, name) for fit in fits]) for name in ("pose", "translation", "shape")))
-
-
-def where(better: Tensor, first: Fit, second: Fit) -> Fit:
-    """The first fits where a condition ``(B,)`` holds, and the second elsewhere."""
-    return Fit(
-        torch.where(better[:, None, None], first.pose, second.pose),
-        torch.where(better[:, None], first.translation, second.translation),
-        torch.where(better[:, None], first.shape, second.shape),
-    )
 
 
 @dataclass
@@ -82,70 +74,73 @@ def left_jacobian(axis_angle: Tensor) -> Tensor:
 
 
 class PosedFamily:
-    """A batch of bodies of a family in their poses: points, normals and Jacobians of chosen vertices."""
+    """A batch of bodies of a family in their poses: points, normals and Jacobians of vertices."""
 
-    def __init__(self, family: BodyFamily, fit: Fit, descendants: Tensor):
-        self.family, self.fit, self.descendants = family, fit, descendants
+    def __init__(self, family: BodyFamily, fit: Fit):
+        self.family, self.fit = family, fit
         self.rotations = rotation_from_axis_angle(fit.pose)
         self.rest, joints = family.rest(fit.shape)
+        self.corrections: Tensor | float = 0.0
         if family.pose_directions is not None:
             features = (self.rotations[:, 1:] - torch.eye(3)).flatten(1)
-            self.rest = self.rest + torch.einsum("bp,vxp->bvx", features, family.pose_directions)
-        self.bones = pose_bones(self.rotations, fit.translation, joints, family.turns(joints), family.bind.parents)
+            self.corrections = torch.einsum("bp,vxp->bvx", features, family.pose_directions)
+            self.rest = self.rest + self.corrections
+        self.bones = self._bones(joints)
 
-    def points(self, ids: Tensor | slice = slice(None)) -> Tensor:
-        """Posed vertices ``(B, N, 3)``, those of ``ids (N,)`` if given."""
-        weights = self.family.bind.weights[ids]
-        return skin(weights, self.bones, self.rest[:, ids])
+    def _bones(self, joints: Tensor) -> Bones:
+        family = self.family
+        return pose_bones(self.rotations, self.fit.translation, joints, family.turns(joints), family.bind.parents)
 
-    def normals(self, rest_normals: Tensor, ids: Tensor | slice = slice(None)) -> Tensor:
-        """Unit normals ``(B, N, 3)`` of posed vertices, from those at rest ``(V, 3)``."""
-        blended = torch.einsum("nj,bjxy->bnxy", self.family.bind.weights[ids], self.bones.turns)
-        turned = (blended @ rest_normals[ids].unsqueeze(-1)).squeeze(-1)
-        return torch.nn.functional.normalize(turned, dim=-1)
+    def points(self) -> Tensor:
+        """All posed vertices ``(B, V, 3)``."""
+        return skin(self.family.bind.weights, self.bones, self.rest)
+
+    def points_of(self, ids: Tensor) -> Tensor:
+        """Posed vertices ``(B, N, 3)`` of ``ids (B, N)``."""
+        return skin(self.family.bind.weights[ids], self.bones, chosen(self.rest, ids))
+
+    def normals(self, rest_normals: Tensor) -> Tensor:
+        """Unit normals ``(B, V, 3)`` of posed vertices, from those at rest ``(V, 3)``."""
+        blended = (self.family.bind.weights @ self.bones.turns.flatten(-2)).unflatten(-1, (3, 3))
+        return torch.nn.functional.normalize((blended @ rest_normals.unsqueeze(-1)).squeeze(-1), dim=-1)
 
     def jacobian(self, ids: Tensor, with_shape: bool = True) -> Tensor:
-        """Derivatives ``(B, N, 3, P)`` of posed vertices ``ids (B, N)`` by P = 3 J pose, 3 translation, K shape numbers.
+        """Derivatives ``(B, N, 3, P)`` of posed vertices ``ids (B, N)`` by P = 3 J pose, 3 place and K shape numbers.
 
         A joint turns what hangs on it about itself: the exact derivative of linear blend skinning. That of pose
         blendshapes is left out.
         """
-        bones, count = self.bones, ids.shape[1]
-        weights = self.family.bind.weights[ids]  # (B, N, J)
-        rest = torch.gather(self.rest, 1, ids.unsqueeze(-1).expand(-1, -1, 3))
-        carried = torch.einsum("bjxy,bny->bnjx", bones.turns, rest) + bones.shifts.unsqueeze(1)
-        carried = carried * weights.unsqueeze(-1)
-        below = torch.einsum("jk,bnkx->bnjx", self.descendants, carried)
-        share = weights @ self.descendants.T
-        levers = below - share.unsqueeze(-1) * bones.places.unsqueeze(1)  # (B, N, J, 3)
-        parents = [max(parent, 0) for parent in self.family.bind.parents]
-        above = bones.frames[:, parents].clone()
+        bones, parents = self.bones, self.family.bind.parents
+        weights, rest = self.family.bind.weights[ids], chosen(self.rest, ids)
+        descendants = joint_descendants(parents)
+        posed = torch.einsum("bjxy,bny->bnjx", bones.turns, rest) + bones.shifts.unsqueeze(1)
+        below = torch.einsum("jk,bnkx->bnjx", descendants, posed * weights.unsqueeze(-1))
+        levers = below - (weights @ descendants.T).unsqueeze(-1) * bones.places.unsqueeze(1)  # (B, N, J, 3)
+        above = bones.frames[:, [max(parent, 0) for parent in parents]].clone()
         above[:, 0] = torch.eye(3)
-        axes = above @ left_jacobian(self.fit.pose)  # (B, J, 3, 3): world axis of each pose number, in columns
-        columns = axes.transpose(-1, -2).unsqueeze(1)  # (B, 1, J, 3 numbers, 3)
-        turned = torch.linalg.cross(columns, levers.unsqueeze(3), dim=-1)  # (B, N, J, 3 numbers, 3)
-        by_pose = turned.flatten(2, 3).transpose(-1, -2)
-        by_place = torch.eye(3).expand(len(ids), count, 3, 3)
-        parts = [by_pose, by_place]
-        if with_shape and len(self.family.names):
+        axes = (above @ left_jacobian(self.fit.pose)).transpose(-1, -2)  # (B, J, 3 pose numbers, 3)
+        turned = torch.linalg.cross(axes.unsqueeze(1), levers.unsqueeze(3), dim=-1)  # (B, N, J, 3 pose numbers, 3)
+        parts = [turned.flatten(2, 3).transpose(-1, -2), torch.eye(3).expand(*ids.shape, 3, 3)]
+        if with_shape and self.family.names:
             parts.append(self._shape_jacobian(ids, weights))
         return torch.cat(parts, dim=-1)
 
     def _shape_jacobian(self, ids: Tensor, weights: Tensor) -> Tensor:
-        """Derivatives ``(B, N, 3, K)`` by shape, as finite differences of the whole chain."""
-        family, fit = self.family, self.fit
-        here = skin(weights, self.bones, torch.gather(self.rest, 1, ids.unsqueeze(-1).expand(-1, -1, 3)))
-        columns = []
+        """Derivatives ``(B, N, 3, K)`` by shape, as differences over `SHAPE_STEP`, inward at the upper bounds."""
+        family, here, columns = self.family, self.points_of(ids), []
         for number in range(len(family.names)):
-            inward = torch.where(fit.shape[:, number] + SHAPE_STEP > family.high[number], -SHAPE_STEP, SHAPE_STEP)
-            shape = fit.shape.clone()
-            shape[:, number] += inward
-            change, joints = family.rest(shape)
-            change = change + (self.rest - family.rest(fit.shape)[0]) if family.pose_directions is not None else change
-            bones = pose_bones(self.rotations, fit.translation, joints, family.turns(joints), family.bind.parents)
-            there = skin(weights, bones, torch.gather(change, 1, ids.unsqueeze(-1).expand(-1, -1, 3)))
-            columns.append((there - here) / inward[:, None, None])
+            step = torch.where(self.fit.shape[:, number] + SHAPE_STEP > family.high[number], -SHAPE_STEP, SHAPE_STEP)
+            shape = self.fit.shape.clone()
+            shape[:, number] += step
+            rest, joints = family.rest(shape)
+            there = skin(weights, self._bones(joints), chosen(rest + self.corrections, ids))
+            columns.append((there - here) / step[:, None, None])
         return torch.stack(columns, dim=-1)
+
+
+def chosen(values: Tensor, ids: Tensor) -> Tensor:
+    """The rows ``ids (B, N)`` of values ``(B, V, 3)``."""
+    return torch.gather(values, 1, ids.unsqueeze(-1).expand(-1, -1, 3))
 
 
 def skin(weights: Tensor, bones: Bones, rest: Tensor) -> Tensor:
@@ -154,7 +149,8 @@ def skin(weights: Tensor, bones: Bones, rest: Tensor) -> Tensor:
     return (turns @ rest.unsqueeze(-1)).squeeze(-1) + weights @ bones.shifts
 
 
-def joint_descendants(parents: Sequence[int]) -> Tensor:
+@cache
+def joint_descendants(parents: tuple[int, ...]) -> Tensor:
     """Which joints hang on which, itself included: ``(J, J)``, 1 where the column's is the row's or below it."""
     below = torch.eye(len(parents))
     for joint in range(len(parents) - 1, 0, -1):

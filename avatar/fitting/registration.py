@@ -1,8 +1,14 @@
-"""Registration of a body to one scan or several: Gauss-Newton on robust, one-sided distances, from many starts."""
+"""Registration of a body to scans: Gauss-Newton steps on robust, one-sided distances, from many starts.
+
+smplfitter and anny's own inverter solve for the pose of a mesh whose vertices are known one by one; scans have no such
+correspondences, so these are searched for in each step, as in iterative closest point methods.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -10,232 +16,310 @@ from torch import Tensor
 
 from avatar.body.families import BodyFamily
 from avatar.body.model import SMPL_JOINTS
-from avatar.fitting.posing import Fit, PosedFamily, joint_descendants, left_jacobian, skin, where
+from avatar.checks import AvatarError, check_oriented
+from avatar.fitting.posing import Fit, PosedFamily, left_jacobian
 from avatar.fitting.prior import drawn_prior
 from avatar.fitting.settings import FittingConfig, StageConfig
 from avatar.geometry.surface import farthest_points
 from avatar.geometry.trees import Tree, build_tree
+from avatar.geometry.units import PERSON, possible_units
 from avatar.records import PointCloud
-from avatar.simulate.angles import pose_from_angles
+from avatar.simulate.angles import SIDES, pose_from_angles
 
 BARE = ("head", "left_wrist", "right_wrist", "left_ankle", "right_ankle", "left_foot", "right_foot")
-FACING = 0.2  # cosine between normals below which two points are no pair
-START_ANGLES = (  # at ease, arms sideways, and raised before the trunk
+FACING, AGREEING = 0.2, 0.5  # cosines between normals below which points are no pair, and from which they fully are
+MOST_POINTS = 20_000  # of a scan that correspondences are searched in
+START_ANGLES = (  # at ease, arms sideways, and arms and knees bent forward
     {},
-    {"left_arm_abduction": 85, "right_arm_abduction": 85, "left_elbow_flexion": 5, "right_elbow_flexion": 5},
-    {"left_arm_flexion": 60, "right_arm_flexion": 60, "left_hip_flexion": 40, "right_hip_flexion": 40,
-     "left_knee_flexion": 50, "right_knee_flexion": 50},
+    {"arm_abduction": 85, "elbow_flexion": 5},
+    {"arm_flexion": 60, "hip_flexion": 40, "knee_flexion": 50},
 )
 
 
 @dataclass(frozen=True)
 class ScanSamples:
-    """A scan prepared for registration: all points with a tree over points and normals, in a random order."""
+    """A scan's points and normals ``(M, 3)`` in a random order, with a tree over both."""
 
-    points: np.ndarray  # (M, 3) float32
-    normals: np.ndarray  # (M, 3)
-    tree: Tree  # of points and normals times the reach
+    points: np.ndarray
+    normals: np.ndarray
+    tree: Tree  # of points and normals times `FittingConfig.normal_reach`
 
 
-def prepare_samples(cloud: PointCloud, config: FittingConfig, most: int = 20_000) -> ScanSamples:
-    """Samples of a scan, at most so many, the same for the same seed."""
-    order = np.random.default_rng(config.seed).permutation(len(cloud.points))[:most]
-    points, normals = (np.asarray(a, np.float32)[order] for a in (cloud.points, cloud.normals))
+def check_scan(cloud: PointCloud, config: FittingConfig, name: str = "scan") -> None:
+    """Refuses a scan that cannot be a person's in metres, y up, or has too few points or no unit normals.
+
+    Raises `AvatarError` with the figure.
+    """
+    count = check_oriented(cloud.points, cloud.normals)["N"]
+    if count < config.least_points:
+        raise AvatarError(f"{name}: expected at least {config.least_points} points, got {count}.")
+    lengths = np.linalg.norm(cloud.normals, axis=1)
+    if (off := float(np.median(np.abs(lengths - 1)))) > 0.1:
+        raise AvatarError(f"{name}: expected unit normals, got lengths off by {off:.3g} (median).")
+    extent = float(np.ptp(cloud.points, axis=0).max())
+    if not PERSON[0] <= extent <= PERSON[1]:
+        units = " or ".join(possible_units(extent))
+        hint = f" Hint: the unit may be {units}." if units else ""
+        raise AvatarError(
+            f"{name}: expected a person of {PERSON[0]} to {PERSON[1]} m, got a largest extent of {extent:.4g}.{hint}"
+        )
+
+
+def prepare_samples(cloud: PointCloud, config: FittingConfig) -> ScanSamples:
+    """Samples of a scan, at most `MOST_POINTS`, the same for the same seed."""
+    order = np.random.default_rng(config.seed).permutation(len(cloud.points))[:MOST_POINTS]
+    points, normals = (np.asarray(array, np.float32)[order] for array in (cloud.points, cloud.normals))
     return ScanSamples(points, normals, build_tree(np.concatenate([points, config.normal_reach * normals], axis=1)))
 
 
-@dataclass
+@dataclass(frozen=True)
 class Pairs:
-    """Corresponding points of B scans and bodies: vertices ``ids (B, N)``, targets, normals and weights."""
+    """Pairs of vertices ``ids (B, N)`` and scan points ``targets (B, N, 3)``, with the normals of where one searched.
+
+    ``matched (B, N)`` in [0, 1] is how far the normals of both agree.
+    """
 
     ids: Tensor
     targets: Tensor
     normals: Tensor
-    outward: float  # 1 where the normals are the body's, -1 where they are the scan's
-    matched: Tensor  # (B, N) in [0, 1], by the normals' agreement
+    matched: Tensor
+
+
+@dataclass(frozen=True)
+class Level:
+    """A family's vertices that a stage looks at, spread over the body."""
+
+    family: BodyFamily
+    normals: Tensor  # (N, 3) at rest
+    bare: Tensor  # (N,) bool, on head, hands and feet, where skin is what a scan shows
 
 
 class Registration:
-    """The objective of B fits to scans, each to one of them, and its Gauss-Newton steps."""
+    """Fits of a family of bodies to scans: starts, stages and objectives."""
 
-    def __init__(self, family: BodyFamily, scans: list[ScanSamples], config: FittingConfig):
-        self.family, self.scans, self.config = family, scans, config
-        self.descendants = joint_descendants(family.bind.parents)
+    def __init__(self, family: BodyFamily, config: FittingConfig):
+        self.family, self.config = family, config
+        self.joints = len(family.bind.parents)
         self.prior = drawn_prior(config.slack)
-        self.rest_normals = family.normals
-        rest = family.rest(family.mean[None])[0][0]
-        most = max(stage.points for stage in config.stages)
-        self.order = body_order(rest, min(most, len(rest)))
-        bare = [SMPL_JOINTS.index(name) for name in BARE]
-        self.bare = family.bind.weights[:, bare].sum(dim=1) > 0.5
+        self.levels: dict[int, Level] = {}
 
-    def starts(self, scan: int, shape: Tensor | None = None) -> Fit:
-        """Fits of every start heading and pose, the body's middle in the scan's."""
-        config = self.config
-        poses = torch.from_numpy(np.concatenate([pose_from_angles(angles, 1) for angles in START_ANGLES]))
+    @cached_property
+    def order(self) -> Tensor:
+        """Vertex ids of which the first n are spread over the body, for any n up to the largest stage's."""
+        rest = self.family.rest(self.family.mean[None])[0][0]
+        return farthest_points(rest, min(max(stage.points for stage in self.config.stages), len(rest)))
+
+    def level(self, points: int) -> Level:
+        """The first vertices of `order`, as a family of their own."""
+        if points not in self.levels:
+            ids, bare = self.order[:points], [SMPL_JOINTS.index(name) for name in BARE]
+            family = self.family.at(ids)
+            shown = family.bind.weights[:, bare].sum(dim=1) > 0.5
+            self.levels[points] = Level(family, self.family.normals[ids], shown)
+        return self.levels[points]
+
+    def starts(self, scan: ScanSamples, shape: Tensor | None = None) -> Fit:
+        """Fits of every start pose in every heading, the body's middle in the scan's."""
+        config, poses = self.config, []
+        for angles in START_ANGLES:
+            both = {f"{side}_{name}": value for side, _ in SIDES for name, value in angles.items()}
+            poses.append(torch.from_numpy(pose_from_angles(both, 1)))
+        poses = torch.cat(poses).repeat(config.headings, 1, 1)
+        turns = torch.arange(config.headings).repeat_interleave(len(START_ANGLES)) / config.headings
         poses[:, 0] = 0
-        fits = []
-        shape = self.family.mean if shape is None else shape
-        for number in range(config.headings):
-            turned = poses.clone()
-            turned[:, 0, 1] = 2 * np.pi * number / config.headings
-            turned[:, 0, 1] = (turned[:, 0, 1] + np.pi) % (2 * np.pi) - np.pi
-            fits.append(turned)
-        poses = torch.cat(fits)
-        fit = Fit(poses, torch.zeros(len(poses), 3), shape.expand(len(poses), -1).clone())
-        middle = PosedFamily(self.family, fit, self.descendants).points(self.order[:500]).median(dim=1).values
-        target = torch.from_numpy(np.median(self.scans[scan].points, axis=0))
-        return Fit(fit.pose, target - middle, fit.shape)
+        poses[:, 0, 1] = 2 * np.pi * (turns - turns.round())
+        shape = (self.family.mean if shape is None else shape).expand(len(poses), -1).clone()
+        fit = Fit(poses, torch.zeros(len(poses), 3), shape)
+        middle = PosedFamily(self.level(config.stages[0].points).family, fit).points().median(dim=1).values
+        return Fit(poses, torch.from_numpy(np.median(scan.points, axis=0)) - middle, shape)
 
-    def pairs(self, posed: PosedFamily, which: list[int], stage: StageConfig) -> tuple[Pairs, Pairs]:
-        """Correspondences from the scan's samples to vertices and back."""
-        config = self.config
-        ids = self.order[: stage.points]
-        points, normals = posed.points(ids), posed.normals(self.rest_normals, ids)
-        described = torch.cat([points, config.normal_reach * normals], dim=-1).numpy()
-        to_body, to_scan = [], []
-        for place, scan in enumerate(which):
-            samples = self.scans[scan]
-            count = stage.points
-            seen = np.concatenate([samples.points[:count], config.normal_reach * samples.normals[:count]], axis=1)
-            nearest = build_tree(described[place]).query(seen)[1]
-            to_body.append((ids[nearest], samples.points[:count], samples.normals[:count], normals[place][nearest]))
-            nearest = samples.tree.query(described[place])[1]
-            to_scan.append((samples.points[nearest], samples.normals[nearest]))
-        targets = torch.from_numpy(np.stack([found[1] for found in to_body]))
-        seen = torch.from_numpy(np.stack([found[2] for found in to_body]))
-        vertex_normals = torch.stack([found[3] for found in to_body])
-        agreement = (vertex_normals * seen).sum(dim=-1)
-        first = Pairs(torch.stack([f[0] for f in to_body]), targets, vertex_normals, 1.0, matched(agreement))
-        targets = torch.from_numpy(np.stack([found[0] for found in to_scan]))
-        seen = torch.from_numpy(np.stack([found[1] for found in to_scan]))
-        agreement = (normals * seen).sum(dim=-1)
-        second = Pairs(ids.expand(len(which), -1), targets, seen, -1.0, matched(agreement))
-        return first, second
+    def fit_one(self, scan: ScanSamples, shape: Tensor | None = None, start: Fit | None = None) -> tuple[Fit, float]:
+        """The best fit of one body to a scan, and its objective in the last stage.
 
-    def terms(self, posed: PosedFamily, pairs: Pairs, stage: StageConfig) -> tuple[Tensor, Tensor, Tensor]:
-        """Offsets ``(B, N, 3)`` of targets from vertices, weights of least squares and robust costs ``(B, N)``."""
+        From many headings and poses or, where there is a ``start`` of one body, from there without the first stage.
+        The shape is estimated as well where none is given.
+        """
+        fit = self.starts(scan, shape) if start is None else start
+        stages = self.config.stages if start is None else self.config.stages[1:] or self.config.stages
+        for stage in stages:
+            fit, objective = self.run(fit, [scan] * len(fit), stage, with_shape=shape is None)
+            best = objective.argsort()[: stage.kept]
+            fit, objective = fit[best], objective[best]
+        return fit[:1], float(objective[0])
+
+    def fit_shape(self, scans: Sequence[ScanSamples], fit: Fit) -> Fit:
+        """Fits with one shape for all scans, from the median of their shapes, over the last two stages."""
+        fit = Fit(fit.pose, fit.translation, fit.shape.median(dim=0).values.expand_as(fit.shape).clone())
+        for stage in self.config.stages[-2:]:
+            fit, _ = self.run(fit, scans, stage, shared=True)
+        return fit
+
+    def run(
+        self, fit: Fit, scans: Sequence[ScanSamples], stage: StageConfig, with_shape: bool = True, shared: bool = False
+    ) -> tuple[Fit, Tensor]:
+        """The fits after the steps of a stage, each to its scan, and their objectives ``(B,)``.
+
+        Correspondences are new in each step, so a step may raise the objective, as in any iterative closest point
+        method; damping keeps it short. ``shared``: all bodies have one shape.
+        """
+        numbers = len(self.family.names) if with_shape else 0
+        for _ in range(stage.steps):
+            hessian, gradient, _ = self.normal_equations(fit, scans, stage, numbers, shared)
+            hessian = hessian + self.config.damping * torch.eye(hessian.shape[1])
+            change = self.solve(fit.shape, hessian.double(), gradient.double(), numbers, shared)
+            fit = self.moved(fit, change.float(), numbers)
+        return fit, self.normal_equations(fit, scans, stage, 0, shared)[2]
+
+    def normal_equations(
+        self, fit: Fit, scans: Sequence[ScanSamples], stage: StageConfig, numbers: int, shared: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Hessians ``(B, P, P)``, descents ``(B, P)`` and objectives ``(B,)`` of data and priors.
+
+        The P unknowns are 3 J of the pose, 3 of the place and some ``numbers`` of the shape.
+        """
+        config, level = self.config, self.level(stage.points)
+        posed = PosedFamily(level.family, fit)
+        system = self.priors(fit, posed, numbers, 1 / len(fit) if shared else 1.0)
+        plane, along = (1 - config.tangential) ** 0.5, config.tangential**0.5
+        for pairs in find_pairs(posed, level, scans, stage, config):
+            offsets = pairs.targets - posed.points_of(pairs.ids)
+            across = (offsets * pairs.normals).sum(dim=-1, keepdim=True)
+            weight, cost = self.robust(offsets, across[..., 0], pairs, level, stage)
+            scale = config.effective / 2 / weight.shape[1] / stage.sigma**2
+            jacobian = posed.jacobian(pairs.ids, numbers > 0)
+            rows = torch.cat(
+                [plane * (jacobian * pairs.normals.unsqueeze(-1)).sum(dim=2, keepdim=True), along * jacobian], dim=2
+            )
+            root = (scale * weight).sqrt().unsqueeze(-1)
+            rows = (rows * root.unsqueeze(-1)).flatten(1, 2)
+            residual = (torch.cat([plane * across, along * offsets], dim=-1) * root).flatten(1, 2)
+            add_rows(system, rows, residual, scale * cost.sum(dim=1))
+        return system
+
+    def robust(
+        self, offsets: Tensor, across: Tensor, pairs: Pairs, level: Level, stage: StageConfig
+    ) -> tuple[Tensor, Tensor]:
+        """Weights in least squares and robust costs ``(B, N)``, square metres, of pairs.
+
+        Geman and McClure's loss of the distance, mostly that across the surface. One-sided: where clothes are worn,
+        scan points outside the skin, away from head, hands and feet, cost a part of what those inside cost, and
+        nothing more once they are well beyond the stage's ``cloth``. Pairs whose normals disagree cost as much as far
+        ones.
+        """
         config = self.config
-        weights = self.family.bind.weights[pairs.ids]
-        rest = torch.gather(posed.rest, 1, pairs.ids.unsqueeze(-1).expand(-1, -1, 3))
-        offsets = pairs.targets - skin(weights, posed.bones, rest)
-        across = (offsets * pairs.normals).sum(dim=-1)
         squared = (1 - config.tangential) * across.square() + config.tangential * offsets.square().sum(dim=-1)
-        scale, base = torch.full_like(across, stage.reach), torch.full_like(across, config.inside)
+        scale, base = torch.full_like(across, stage.reach), torch.ones_like(across)
         if config.clothing:
-            over = (across > 0) & ~self.bare[pairs.ids]
+            over = (across > 0) & ~level.bare[pairs.ids]
             scale, base = torch.where(over, stage.cloth, scale), torch.where(over, config.outside, base)
         known = scale**2 / (scale**2 + squared)
-        weight = base * known.square() * pairs.matched
-        cost = base * (squared * known * pairs.matched + scale**2 * (1 - pairs.matched))
-        return offsets, weight, cost
+        cost = squared * known * pairs.matched + scale**2 * (1 - pairs.matched)
+        return base * known.square() * pairs.matched, base * cost
 
-    def normal_equations(self, fit: Fit, which: list[int], stage: StageConfig, with_shape: bool):
-        """Hessians ``(B, P, P)``, gradients ``(B, P)`` and objectives ``(B,)`` of the data and the priors."""
-        config, batch = self.config, len(fit)
-        posed = PosedFamily(self.family, fit, self.descendants)
-        joints = len(self.family.bind.parents)
-        sizes = 3 * joints + 3 + (len(self.family.names) if with_shape else 0)
-        hessian, gradient = torch.zeros(batch, sizes, sizes), torch.zeros(batch, sizes)
-        objective = torch.zeros(batch)
-        for pairs in self.pairs(posed, which, stage):
-            offsets, weight, cost = self.terms(posed, pairs, stage)
-            scale = config.effective / 2 / weight.shape[1] / stage.sigma**2
-            jacobian = posed.jacobian(pairs.ids, with_shape)
-            across = (jacobian * pairs.normals.unsqueeze(-1)).sum(dim=2, keepdim=True)
-            plane, along = (1 - config.tangential) ** 0.5, config.tangential**0.5
-            rows = torch.cat([plane * across, along * jacobian], dim=2)
-            residual = torch.cat(
-                [plane * (offsets * pairs.normals).sum(dim=-1, keepdim=True), along * offsets], dim=-1
-            )
-            root = (scale * weight).sqrt()
-            rows = (rows * root[..., None, None]).flatten(1, 2)
-            residual = (residual * root[..., None]).flatten(1, 2)
-            hessian += rows.transpose(1, 2) @ rows
-            gradient += (rows.transpose(1, 2) @ residual.unsqueeze(-1)).squeeze(-1)
-            objective += scale * cost.sum(dim=1)
-        self.add_priors(fit, posed, hessian, gradient, objective, with_shape)
-        return hessian, gradient, objective
-
-    def add_priors(self, fit: Fit, posed: PosedFamily, hessian, gradient, objective, with_shape: bool) -> None:
-        """Adds pose, tilt and shape priors in place."""
-        config = self.config
-        joints = len(self.family.bind.parents)
-        inner = slice(3, 3 * joints)
+    def priors(self, fit: Fit, posed: PosedFamily, numbers: int, share: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Normal equations and objectives of the priors of pose, upright pelvis and, with a ``share`` of it, shape."""
+        size = 3 * self.joints + 3
+        system = (
+            torch.zeros(len(fit), size + numbers, size + numbers),
+            torch.zeros(len(fit), size + numbers),
+            torch.zeros(len(fit)),
+        )
+        hessian, descent, objective = system
+        inner, outer = slice(3, 3 * self.joints), slice(size, None)
         off = self.prior.mean - fit.pose[:, 1:].flatten(1)
         pull = off @ self.prior.precision
-        hessian[:, inner, inner] += config.pose_weight * self.prior.precision
-        gradient[:, inner] += config.pose_weight * pull
-        objective += config.pose_weight * (pull * off).sum(dim=1)
+        hessian[:, inner, inner] += self.prior.precision
+        descent[:, inner] += pull
+        objective += (pull * off).sum(dim=1)
         up = posed.rotations[:, 0, :, 1]
         turning = torch.linalg.cross(left_jacobian(fit.pose[:, 0]).transpose(-1, -2), up.unsqueeze(1), dim=-1)
-        rows = turning[..., [0, 2]].transpose(-1, -2) / config.tilt  # (B, 2, 3)
-        residual = -up[:, [0, 2]] / config.tilt
-        hessian[:, :3, :3] += rows.transpose(1, 2) @ rows
-        gradient[:, :3] += (rows.transpose(1, 2) @ residual.unsqueeze(-1)).squeeze(-1)
-        objective += residual.square().sum(dim=1) + torch.where(up[:, 1] < 0, 10.0, 0.0)
-        if len(self.family.names):
-            off = (self.family.mean - fit.shape) / self.family.std
-            objective += config.shape_weight * off.square().sum(dim=1)
-            if with_shape:
-                outer = slice(3 * joints + 3, None)
-                hessian[:, outer, outer] += config.shape_weight * torch.diag(self.family.std**-2)
-                gradient[:, outer] += config.shape_weight * off / self.family.std
+        rows = torch.zeros(len(fit), 2, size + numbers)
+        rows[..., :3] = turning[..., [0, 2]].transpose(-1, -2) / self.config.tilt
+        residual = -up[:, [0, 2]] / self.config.tilt
+        add_rows(system, rows, residual, residual.square().sum(dim=1))
+        off = (self.family.mean - fit.shape) / self.family.std
+        objective += share * off.square().sum(dim=1)
+        if numbers:
+            hessian[:, outer, outer] += share * torch.diag(self.family.std**-2)
+            descent[:, outer] += share * off / self.family.std
+        return system
 
-    def run(self, fit: Fit, which: list[int], stage: StageConfig, with_shape: bool = True) -> tuple[Fit, Tensor]:
-        """The fits after the steps of a stage, and their objectives.
+    def solve(self, shape: Tensor, hessian: Tensor, descent: Tensor, numbers: int, shared: bool) -> Tensor:
+        """Changes ``(B, P)`` that minimise the quadratic models, with the shapes within their bounds.
 
-        Correspondences are new in each step, so a step may raise the objective (as in any iterative closest point
-        method); damping keeps it short.
+        Poses are eliminated first (Schur's complement). Shape numbers that would leave their bounds stop there, and
+        the others are solved for again.
         """
-        for _ in range(stage.steps):
-            hessian, gradient, _ = self.normal_equations(fit, which, stage, with_shape)
-            damped = hessian + self.config.damping * torch.eye(hessian.shape[1])
-            fit = self.moved(fit, self.solve(fit, damped, gradient, with_shape), with_shape)
-        return fit, self.normal_equations(fit, which, stage, with_shape=False)[2]
+        size = hessian.shape[1] - numbers
+        inner, cross = hessian[:, :size, :size], hessian[:, :size, size:]
+        solved = torch.linalg.solve(inner, torch.cat([descent[:, :size, None], cross], dim=-1))
+        if not numbers:
+            return solved[..., 0]
+        reduced = hessian[:, size:, size:] - cross.transpose(1, 2) @ solved[..., 1:]
+        right = descent[:, size:] - (cross.transpose(1, 2) @ solved[..., :1])[..., 0]
+        if shared:
+            reduced, right = (part.sum(dim=0, keepdim=True).expand_as(part) for part in (reduced, right))
+        change = torch.linalg.solve(reduced, right)
+        bounded = (shape + change).clamp(self.family.low, self.family.high) - shape
+        held = ((bounded - change).abs() > 1e-9).double()
+        fixed, free = bounded * held, 1 - held
+        reduced_free = reduced * free.unsqueeze(1) * free.unsqueeze(2) + torch.diag_embed(held)
+        rest = (right - (reduced @ fixed.unsqueeze(-1))[..., 0]) * free
+        change = torch.linalg.solve(reduced_free, rest) + fixed
+        pose = solved[..., 0] - (solved[..., 1:] @ change.unsqueeze(-1))[..., 0]
+        return torch.cat([pose, change], dim=1)
 
-    def solve(self, fit: Fit, hessian: Tensor, gradient: Tensor, with_shape: bool) -> Tensor:
-        """Changes ``(B, P)`` that minimise the quadratic models with the shapes within their bounds.
-
-        Shape numbers that would leave their bounds stop there, and the others are solved for again.
-        """
-        hessian, gradient = hessian.double(), gradient.double()
-        change = torch.linalg.solve(hessian, gradient)
-        if not with_shape or not self.family.names:
-            return change.float()
-        outer = slice(hessian.shape[1] - len(self.family.names), None)
-        wanted = fit.shape + change[:, outer]
-        held = torch.zeros_like(gradient)
-        held[:, outer] = (wanted.clamp(self.family.low, self.family.high) != wanted).double()
-        fixed = torch.zeros_like(gradient)
-        fixed[:, outer] = wanted.clamp(self.family.low, self.family.high) - fit.shape
-        fixed = fixed * held
-        free = 1 - held
-        rest = gradient - (hessian @ fixed.unsqueeze(-1)).squeeze(-1)
-        reduced = hessian * free.unsqueeze(1) * free.unsqueeze(2) + torch.diag_embed(held)
-        return (torch.linalg.solve(reduced, rest * free) + fixed).float()
-
-    def moved(self, fit: Fit, change: Tensor, with_shape: bool) -> Fit:
-        """Fits after a change ``(B, P)``, too long ones shortened, shapes within their bounds."""
-        joints = len(self.family.bind.parents)
-        longest = change[:, : 3 * joints + 3].abs().max(dim=1, keepdim=True).values
+    def moved(self, fit: Fit, change: Tensor, numbers: int) -> Fit:
+        """Fits after changes ``(B, P)``, those of pose and place shortened where too long; the root's turn below pi."""
+        size = 3 * self.joints + 3
+        longest = change[:, :size].abs().max(dim=1, keepdim=True).values
         change = change * (self.config.longest_step / longest.clamp(min=self.config.longest_step))
-        pose = fit.pose + change[:, : 3 * joints].unflatten(1, (joints, 3))
+        pose = fit.pose + change[:, : size - 3].unflatten(1, (self.joints, 3))
         angle = pose[:, :1].norm(dim=-1, keepdim=True)
         root = torch.where(angle > np.pi, pose[:, :1] * (1 - 2 * np.pi / angle.clamp(min=1e-6)), pose[:, :1])
-        pose = torch.cat([root, pose[:, 1:]], dim=1)
-        translation = fit.translation + change[:, 3 * joints : 3 * joints + 3]
         shape = fit.shape
-        if with_shape and len(self.family.names):
-            shape = (shape + change[:, 3 * joints + 3 :]).clamp(self.family.low, self.family.high)
-        return Fit(pose, translation, shape)
+        if numbers:
+            shape = (shape + change[:, size:]).clamp(self.family.low, self.family.high)
+        return Fit(torch.cat([root, pose[:, 1:]], dim=1), fit.translation + change[:, size - 3 : size], shape)
 
 
-def matched(agreement: Tensor) -> Tensor:
-    """How far normals agree, 0 from `FACING` downwards and 1 from 60 degrees on."""
-    return ((agreement - FACING) / (0.5 - FACING)).clamp(0, 1)
+def add_rows(system: tuple[Tensor, Tensor, Tensor], rows: Tensor, residual: Tensor, cost: Tensor) -> None:
+    """Adds the rows ``(B, R, P)`` of a least squares problem, and its cost ``(B,)``, to normal equations in place."""
+    hessian, descent, objective = system
+    hessian += rows.transpose(1, 2) @ rows
+    descent += (rows.transpose(1, 2) @ residual.unsqueeze(-1)).squeeze(-1)
+    objective += cost
 
 
-def body_order(vertices: Tensor, count: int) -> Tensor:
-    """Vertex ids ``(count,)`` of which the first n are spread over the body, for any n."""
-    return farthest_points(vertices, count)
+def find_pairs(
+    posed: PosedFamily, level: Level, scans: Sequence[ScanSamples], stage: StageConfig, config: FittingConfig
+) -> tuple[Pairs, Pairs]:
+    """The nearest vertex of each scan sample and the nearest scan point of each vertex, by place and normal.
+
+    Normals in the pairs are those of what was found: the vertices' first, then the scan points'.
+    """
+    points, normals = posed.points(), posed.normals(level.normals)
+    described = torch.cat([points, config.normal_reach * normals], dim=-1).numpy()
+    places, found, targets, seen = [], [], [], []
+    for place, scan in enumerate(scans):
+        sampled, facing = scan.points[: stage.points], scan.normals[: stage.points]
+        nearest = build_tree(described[place]).query(np.concatenate([sampled, config.normal_reach * facing], axis=1))[1]
+        places.append(torch.from_numpy(nearest))
+        found.append((sampled, facing))
+        nearest = scan.tree.query(described[place])[1]
+        targets.append(scan.points[nearest])
+        seen.append(scan.normals[nearest])
+    ids = torch.stack(places)
+    own = torch.gather(normals, 1, ids.unsqueeze(-1).expand(-1, -1, 3))
+    sampled, facing = (torch.from_numpy(np.stack(part)) for part in zip(*found))
+    outward = torch.from_numpy(np.stack(seen))
+    every = torch.arange(points.shape[1]).expand(len(points), -1)
+    return (
+        Pairs(ids, sampled, own, agreement(own, facing)),
+        Pairs(every, torch.from_numpy(np.stack(targets)), outward, agreement(normals, outward)),
+    )
+
+
+def agreement(first: Tensor, second: Tensor) -> Tensor:
+    """How far unit normals ``(..., 3)`` agree: 0 from `FACING` downwards and 1 from `AGREEING` upwards."""
+    return (((first * second).sum(dim=-1) - FACING) / (AGREEING - FACING)).clamp(0, 1)

@@ -13,10 +13,15 @@ class StageConfig:
 
     points: int = 1000  # samples of the scan and of the body
     steps: int = 15  # Gauss-Newton steps, each with new correspondences
-    kept: int = 1  # starts that go on, those of the least objective
-    reach: float = 0.1  # m; distances well beyond count little (scale of Geman and McClure's loss)
-    cloth: float = 0.05  # m; the same outside the skin, where cloth may lie between
-    sigma: float = 0.02  # m; a distance that weighs as much as one standard deviation of the priors
+    kept: int = 1  # starts that go on to the next stage, those of the least objective
+    reach: float = 0.1  # m, distances well beyond count little (scale of Geman and McClure's loss)
+    cloth: float = 0.05  # m, the same outside the skin, where cloth may lie between
+    sigma: float = 0.02  # m, a distance that weighs as much as one standard deviation of the priors
+
+    def __post_init__(self):
+        check_range(self, "points", "kept", low=1)
+        check_range(self, "steps", low=0)
+        check_range(self, "reach", "cloth", "sigma", above=0, high=1)
 
 
 def default_stages() -> list[StageConfig]:
@@ -30,27 +35,43 @@ def default_stages() -> list[StageConfig]:
 
 
 @dataclass
+class QualityConfig:
+    """What a frame's fit must reach, or it is reported as failed."""
+
+    inside: float = 0.05  # largest share of the scan's points more than 1 cm inside the body
+    bare: float = 0.015  # m, largest median distance of the scan from the bare skin of head, hands and feet
+    covered: float = 0.8  # least share of the body with the scan near or over it
+    objective: float = 600.0  # largest objective of the last stage, in the priors' squared standard deviations
+
+    def __post_init__(self):
+        check_range(self, "inside", "bare", "covered", "objective", low=0)
+
+
+@dataclass
 class FittingConfig:
     """How bodies are fitted to scans."""
 
     clothing: bool = True  # cloth may lie outside the skin; false: the scan is the skin itself, both sides cost alike
+    sequence: bool = False  # scans follow each other in time: each fit starts from the one before
+    shape_frames: int = 8  # scans, spread over all, that a subject's one shape is estimated from
     headings: int = 8  # turns about the vertical that a fit starts from
-    stages: list[StageConfig] = field(default_factory=default_stages)
+    stages: list[StageConfig] = field(default_factory=default_stages)  # coarse to fine
     effective: float = 300.0  # independent distances that the samples of a scan are worth against the priors
-    inside: float = 1.0  # weight of skin outside the scan
-    outside: float = 0.3  # weight of cloth outside the skin, against the same distance the other way
-    tangential: float = 0.1  # weight of distances along the surface, against those across it
-    normal_reach: float = 0.1  # m; what a turn of normals by a radian counts as in the search for correspondences
-    slack: float = 0.1  # rad; standard deviation that the pose prior grants beyond drawn poses
-    pose_weight: float = 1.0  # of the pose prior
-    shape_weight: float = 1.0  # of the shape prior
-    tilt: float = 0.3  # rad; standard deviation of the pelvis's tilt
-    damping: float = 1.0  # added to the normal equations' diagonal, in units of the priors' precision
-    longest_step: float = 0.4  # rad and m; longer steps are shortened
-    shape_frames: int = 8  # scans that a subject's one shape is estimated from
-    seed: int = 0  # of the samples
+    outside: float = 0.3  # weight of cloth outside the skin, against skin outside the scan
+    tangential: float = 0.1  # share of distances along the surface in the squared distances
+    normal_reach: float = 0.1  # m, what unit difference of normals counts as in the search for correspondences
+    slack: float = 0.1  # rad, standard deviation that the pose prior grants beyond drawn poses
+    tilt: float = 0.3  # rad, standard deviation of the pelvis's tilt
+    damping: float = 1.0  # added to the normal equations' diagonal, in the priors' precision
+    longest_step: float = 0.4  # rad and m, longer steps are shortened
+    least_points: int = 2000  # of a scan; fewer are refused
+    seed: int = 0  # of the scan's samples
+    quality: QualityConfig = field(default_factory=QualityConfig)
 
     def __post_init__(self):
-        if self.headings < 1 or not self.stages:
-            raise AvatarError(f"headings, stages: expected at least 1, got {self.headings} and {len(self.stages)}.")
-        check_range(self, "effective", "sigma_floor" if hasattr(self, "sigma_floor") else "tilt", above=0)
+        if not self.stages:
+            raise AvatarError("stages: expected at least one, got none.")
+        check_range(self, "headings", "shape_frames", "least_points", low=1)
+        check_range(self, "effective", "slack", "tilt", "longest_step", above=0)
+        check_range(self, "outside", "tangential", low=0, high=1)
+        check_range(self, "normal_reach", "damping", low=0)
