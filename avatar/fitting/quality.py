@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +79,16 @@ def write_quality(path: Path, names: Sequence[str], qualities: Sequence[FitQuali
     write_whole(path, csv_text(columns, rows).encode())
     bad = [name for name, why in zip(names, failed) if why]
     lines = [f"{len(names)} frames fitted, {len(bad)} failed{': ' + ', '.join(bad) if bad else ''}.", ""]
-    heads = ("frame", "outside, median mm", "outside, 95% mm", "inside", "bare skin mm", "covered", "objective", "failed")
+    heads = (
+        "frame",
+        "outside, median mm",
+        "outside, 95% mm",
+        "inside",
+        "bare skin mm",
+        "covered",
+        "objective",
+        "failed",
+    )
     lines += [f"| {' | '.join(heads)} |", "|---|" + "---:|" * 6 + "---|"]
     for name, q, why in zip(names, qualities, failed):
         cells = [name, f"{1000 * q.outside_median:.1f}", f"{1000 * q.outside_p95:.1f}", f"{q.inside_share:.1%}"]
@@ -88,11 +97,15 @@ def write_quality(path: Path, names: Sequence[str], qualities: Sequence[FitQuali
     write_whole(path.with_suffix(".md"), ("\n".join(lines) + "\n").encode())
 
 
-def picture_fit(cloud: PointCloud, body: Mesh, size: tuple[int, int] = (360, 540)) -> np.ndarray:
-    """A picture ``(H, W, 3)`` uint8: scan, fitted body and both over each other, from the front and from the left."""
+def picture_fit(cloud: PointCloud, body: Mesh, heading: float = 0.0, size: tuple[int, int] = (360, 540)) -> np.ndarray:
+    """A picture ``(H, W, 3)`` uint8: scan, fitted body and both over each other, from the front and from the left.
+
+    ``heading`` radians is where the person looks, about the vertical from +z towards +x.
+    """
     camera, rows = frame_camera(np.concatenate([cloud.points, body.vertices]), size=size), []
     for view in ("front", "left"):
         seen = camera.seen_from(view)
+        seen = replace(seen, azimuth=seen.azimuth + float(np.degrees(heading)))
         scan, mesh = render_points(cloud, seen, SCAN_COLOR), render_mesh(body, seen)
         rows.append([scan, mesh, ((scan.astype(np.uint16) + mesh) // 2).astype(np.uint8)])
     return contact_sheet(rows, ("front", "left"), ("scan", "fitted body", "both"))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from avatar.body.families import BodyFamily
 from avatar.body.model import BodyModel
@@ -34,6 +37,12 @@ class FrameFit:
     translation: np.ndarray
     quality: FitQuality
     failed: str = ""  # the reasons, empty for a good fit
+
+    @property
+    def heading(self) -> float:
+        """Where the pelvis looks, radians about the vertical from +z towards +x."""
+        ahead = Rotation.from_rotvec(self.pose[0]).apply([0, 0, 1])
+        return float(np.arctan2(ahead[0], ahead[2]))
 
 
 @dataclass(frozen=True)
@@ -98,6 +107,7 @@ class Subject:
         self.scans, self.names, self.family, self.config = scans, names, family, config
         self.ledger, self.progress = ledger, progress
         self.registration = Registration(family, config)
+        self.known: dict[int, Fit] = {}  # of the scans that the shape was estimated from, each in its own shape
         self.key = keyed(SOURCE, config=asdict(config), family=family_digest(family))
         bare = [family.bind.joint_names.index(name) for name in BARE]
         self.bare = (family.bind.weights[:, bare].sum(dim=1) > 0.5).numpy()
@@ -120,21 +130,16 @@ class Subject:
         for number in tracked(numbers, "fit the shape", "scan", silent=not self.progress):
             cloud, samples = self.load(number)
             prints.append(cloud_digest(cloud))
-            fit, cost = self._once(
-                f"start/{self.names[number]}",
-                {"clothing": clothing, "scan": prints[-1]},
-                lambda samples=samples: registration.fit_one(samples),
-            )
+            made_of = {"clothing": clothing, "scan": prints[-1]}
+            fit, cost = self._once(f"start/{self.names[number]}", made_of, partial(registration.fit_one, samples))
             fits.append(fit)
+            self.known[number] = fit
             kept.append(samples)
             costs.append(cost)
         good = [i for i, cost in enumerate(costs) if cost <= 2 * float(np.median(costs))]
-        together = {"clothing": clothing, "scans": prints, "numbers": numbers}
-        fit, _ = self._once(
-            "shape",
-            together,
-            lambda: (registration.fit_shape([kept[i] for i in good], join_fits([fits[i] for i in good]))[:1], 0.0),
-        )
+        made_of = {"clothing": clothing, "scans": prints, "numbers": numbers}
+        scans, starts = [kept[i] for i in good], join_fits([fits[i] for i in good])
+        fit, _ = self._once("shape", made_of, lambda: (registration.fit_shape(scans, starts)[:1], 0.0))
         return fit.shape[0]
 
     def fit_poses(self, shape: torch.Tensor) -> SubjectFit:
@@ -142,29 +147,25 @@ class Subject:
         body = self.family.body(shape)
         frames: list[FrameFit] = []
         previous: Fit | None = None
-        chain = ""
         for number in tracked(range(len(self.scans)), "fit bodies", "scan", silent=not self.progress):
             cloud, samples = self.load(number)
-            made_of = {"shape": shape.tolist(), "scan": cloud_digest(cloud), "previous": chain}
-
-            def fit(samples: ScanSamples = samples, cloud: PointCloud = cloud, start: Fit | None = previous):
-                return self._fit_pose(samples, cloud, shape, start)
-
-            found, objective = self._once(f"pose/{self.names[number]}", made_of, fit)
+            start = self.known.get(number) if previous is None else previous
+            start = start and Fit(start.pose, start.translation, shape[None])
+            made_of = {"shape": shape.tolist(), "scan": cloud_digest(cloud), "start": start and start.pose.tolist()}
+            found, objective = self._once(
+                f"pose/{self.names[number]}", made_of, partial(self._fit_pose, samples, cloud, shape, start)
+            )
             frame = self._measured(self.names[number], cloud, found, objective)
             if frame.failed:
                 log.warning("%s: the fit failed: %s.", frame.name, frame.failed)
             frames.append(frame)
-            if self.config.sequence and not frame.failed:
-                previous, chain = found, digest_of(found.pose.tolist())
-            else:
-                previous, chain = None, ""
+            previous = found if self.config.sequence and not frame.failed else None
         return SubjectFit(dict(zip(self.family.names, shape.tolist())), body, tuple(frames))
 
     def _fit_pose(
         self, samples: ScanSamples, cloud: PointCloud, shape: torch.Tensor, start: Fit | None
     ) -> tuple[Fit, float]:
-        """The fit from the scan before, or from all starts where there is none or it leads nowhere."""
+        """The fit from a start, or from all of them where there is none or it leads nowhere."""
         if start is not None:
             found = self.registration.fit_one(samples, shape, start)
             if not self._measured("", cloud, *found).failed:
@@ -179,7 +180,7 @@ class Subject:
         reasons = "; ".join(quality.failures(self.config.quality))
         return FrameFit(name, fit.pose[0].numpy(), fit.translation[0].numpy(), quality, reasons)
 
-    def _once(self, name: str, made_of: dict, fit) -> tuple[Fit, float]:
+    def _once(self, name: str, made_of: dict[str, Any], fit: Callable[[], tuple[Fit, float]]) -> tuple[Fit, float]:
         """A fit of one body with its objective: the ledger's, or a new one."""
         key = digest_of([self.key, made_of])
         note = self.ledger.find(name, key) if self.ledger is not None else None
