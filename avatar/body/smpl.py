@@ -105,6 +105,16 @@ def smpl_body(
         return BodyModel(bind, None, canonical_pose, float32_tensor(posedirs))
 
 
+def smpl_shapes(path: Path, components: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first shape components of a converted model: displacements of vertices ``(C, V, 3)`` and of the 22 joints
+    ``(C, 22, 3)``, metres a standard deviation, float32; fewer where the file has fewer. Errors as in `smpl_body`.
+    """
+    model = _read_model(path, None)
+    directions = np.moveaxis(model["shapedirs"][..., :components].astype(np.float64), -1, 0)
+    joints = np.einsum("jv,cvx->cjx", model["J_regressor"][: len(SMPL_JOINTS)], directions)
+    return directions.astype(np.float32), joints.astype(np.float32)
+
+
 def merge_weights(weights: np.ndarray, parents: Sequence[int], count: int) -> np.ndarray:
     """Skinning weights ``(V, J)`` of the first ``count`` joints, each later one's added to its nearest ancestor."""
     merged = weights.copy()

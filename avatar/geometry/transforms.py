@@ -86,23 +86,25 @@ def tilt_rotations(rotations: Tensor) -> Tensor:
 
 
 def rotation_between(source: Tensor, target: Tensor) -> Tensor:
-    """The smallest rotation that turns one direction ``(3,)`` onto another, ``(3, 3)``; worked out in float64.
+    """The smallest rotations that turn directions onto others, ``(..., 3)`` to ``(..., 3, 3)``; worked out in float64.
 
     Of the half turns between opposite directions, that about a perpendicular nearest a coordinate axis. Raises
     `AvatarError` for a direction of no length.
     """
-    check_shape("source", source, "3")
-    check_shape("target", target, "3")
+    check_shape("source", source, "... 3")
+    check_shape("target", target, "... 3")
     dtype = source.dtype
-    source, target = source.double(), target.double()
-    if min(source.norm(), target.norm()) == 0:
+    source, target = torch.broadcast_tensors(source.double(), target.double())
+    lengths = source.norm(dim=-1, keepdim=True), target.norm(dim=-1, keepdim=True)
+    if any((length == 0).any() for length in lengths):
         raise AvatarError("source, target: expected two directions, got a zero vector.")
-    source, target = source / source.norm(), target / target.norm()
+    source, target = source / lengths[0], target / lengths[1]
     axis = torch.linalg.cross(source, target)
-    angle = torch.atan2(axis.norm(), source @ target)
-    if axis.norm() < 1e-8:  # (anti)parallel: the cross product no longer tells the axis
-        axis = torch.linalg.cross(source, torch.eye(3, dtype=source.dtype, device=source.device)[source.abs().argmin()])
-    return rotation_from_axis_angle(axis / axis.norm() * angle).to(dtype)
+    angle = torch.atan2(axis.norm(dim=-1), (source * target).sum(dim=-1))
+    parallel = axis.norm(dim=-1, keepdim=True) < 1e-8  # (anti)parallel: the cross product no longer tells the axis
+    aside = torch.eye(3, dtype=source.dtype, device=source.device)[source.abs().argmin(dim=-1)]
+    axis = torch.where(parallel, torch.linalg.cross(source, aside), axis)
+    return rotation_from_axis_angle(axis / axis.norm(dim=-1, keepdim=True) * angle.unsqueeze(-1)).to(dtype)
 
 
 def fourier_features(points: Tensor, orders: int, base: float = 1.0) -> Tensor:

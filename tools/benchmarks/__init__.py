@@ -1,4 +1,4 @@
-"""Benchmarks of speed and memory: the main job beside reference implementations and other libraries."""
+"""Benchmarks: speed and memory beside reference implementations and other libraries; errors of fitted bodies."""
 
 from pathlib import Path
 
@@ -9,4 +9,10 @@ BENCH = Verb(
     "benchmarks.bench:bench",
     "benchmarks.bench:BenchConfig",
     conf=Path(__file__).with_name("bench.yaml"),
+)
+FIT_BODIES = Verb(
+    "measures bodies fitted to scans against the true ones",
+    "benchmarks.fitting:fit_bodies",
+    "FitBodiesConfig",
+    conf=Path(__file__).with_name("fit_bodies.yaml"),
 )
