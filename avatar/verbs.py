@@ -90,6 +90,11 @@ VERBS = {
         "avatar.pipeline.intake:data_convert",
         "avatar.sources.conversion:ConvertConfig",
     ),
+    "data_fit": Verb(
+        "fits a body to scans that have none, and converts them with it",
+        "avatar.pipeline.intake:data_fit",
+        "avatar.sources.registered:FitScansConfig",
+    ),
     "doctor": Verb("lists what is installed and what is missing", "avatar.cli:doctor"),
 }
 
@@ -119,6 +124,8 @@ OPTIONS = {  # that a verb's help begins with, a dozen at most
     "data_info": "source layout outfits",
     "data_check": "source layout outfits frames units up body.path body.betas fits out",
     "data_convert": "source dataset name layout outfits units up body.path body.betas fits test data_root",
+    "data_fit": "source dataset name layout units up body.path minimal fitting.headings fitting.clothing pictures "
+    "data_root",
 }
 
 SHARED = {  # what options mean in several verbs

@@ -3,6 +3,7 @@
 python tools/data.py info source=scans
 python tools/data.py check source=scans
 python tools/data.py convert source=scans dataset=mine name=coat
+python tools/data.py fit source=scans dataset=mine name=coat
 """
 
 from start import run

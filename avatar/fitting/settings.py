@@ -24,14 +24,12 @@ class StageConfig:
         check_range(self, "reach", "cloth", "sigma", above=0, high=1)
 
 
-def default_stages() -> list[StageConfig]:
-    """Coarse with all starts, then the best few, then one."""
-    return [
-        StageConfig(points=300, steps=12, kept=6, reach=0.3, cloth=0.3, sigma=0.05),
-        StageConfig(points=600, steps=10, kept=2, reach=0.1, cloth=0.1, sigma=0.03),
-        StageConfig(points=1500, steps=12, kept=1, reach=0.05, cloth=0.03, sigma=0.02),
-        StageConfig(points=4000, steps=10, kept=1, reach=0.03, cloth=0.015, sigma=0.01),
-    ]
+STAGES = (  # coarse with all starts, then the best few, then one
+    StageConfig(points=300, steps=12, kept=6, reach=0.3, cloth=0.3, sigma=0.05),
+    StageConfig(points=600, steps=10, kept=2, reach=0.1, cloth=0.1, sigma=0.03),
+    StageConfig(points=1500, steps=12, kept=1, reach=0.05, cloth=0.03, sigma=0.02),
+    StageConfig(points=4000, steps=10, kept=1, reach=0.03, cloth=0.015, sigma=0.01),
+)
 
 
 @dataclass
@@ -55,7 +53,7 @@ class FittingConfig:
     sequence: bool = False  # scans follow each other in time: each fit starts from the one before
     shape_frames: int = 8  # scans, spread over all, that a subject's one shape is estimated from
     headings: int = 8  # turns about the vertical that a fit starts from
-    stages: list[StageConfig] = field(default_factory=default_stages)  # coarse to fine
+    stages: list[StageConfig] = field(default_factory=lambda: list(STAGES))  # coarse to fine
     effective: float = 300.0  # independent distances that the samples of a scan are worth against the priors
     outside: float = 0.3  # weight of cloth outside the skin, against skin outside the scan
     tangential: float = 0.1  # share of distances along the surface in the squared distances

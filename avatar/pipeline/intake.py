@@ -1,9 +1,10 @@
-"""`data info`, `data check` and `data convert`: what other people's data hold, measured, and made outfits of ours."""
+"""`data info`, `check`, `convert` and `fit`: what other people's data hold, measured, and made outfits of ours."""
 
 from __future__ import annotations
 
 import csv
 import io
+import logging
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -16,7 +17,10 @@ from avatar.io.npz import write_whole
 from avatar.sources.base import Source, SourceConfig
 from avatar.sources.conversion import ConvertConfig, SourceOutfit, convert_outfit
 from avatar.sources.findings import Findings, FrameFinding, describe, measure_outfit
+from avatar.sources.registered import FitScansConfig, fit_outfit_body
 from avatar.sources.registry import open_sources
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -72,11 +76,31 @@ def data_convert(config: ConvertConfig) -> list[Path]:
 
     Raises `AvatarError` where one ``name`` is given for several outfits.
     """
+    return [convert_outfit(source, config) for source in several_sources(config)]
+
+
+@prepared_process()
+def data_fit(config: FitScansConfig) -> list[Path]:
+    """Fits a body to the scans of every outfit of a source and converts them with it (`fit_outfit_body`).
+
+    Raises `AvatarError` where one ``name`` is given for several outfits.
+    """
+    written = []
+    for source in several_sources(config):
+        folder, failed = fit_outfit_body(source, config)
+        for name in failed:
+            log.warning("fit: no body fits %s of %s: %s", name, source.name, folder / "fits" / "fits.md")
+        written.append(folder)
+    return written
+
+
+def several_sources(config: ConvertConfig) -> list[Source]:
+    """The outfits of a source. Raises `AvatarError` where one ``name`` is given for several."""
     sources = open_sources(config)
     if config.name and len(sources) > 1:
         listed = ", ".join(source.name for source in sources)
         raise AvatarError(f"name: expected none for several outfits, got {config.name!r} for {listed}.")
-    return [convert_outfit(source, config) for source in sources]
+    return sources
 
 
 def opened_outfits(config: SourceConfig) -> list[Outfit]:

@@ -18,7 +18,7 @@ from avatar.progress import WORK, in_words
 from avatar.verbs import typed_words
 
 RESUMED = ("simulate", "canonicalize", "template", "train", "predict", "evaluate", "texture", "mesh", "experiment")
-RESUMED += ("data_convert",)
+RESUMED += ("data_convert", "data_fit")
 SPLITS = ("train", "test", "interpolation", "validation")
 STOP = "stop"  # a file in the folder of a multirun that was asked to stop
 report = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ def find_ending(verb: str, config: Any, result: Any) -> tuple[list[Path], list[s
             root, names = config.root, [name for name, _ in dressed_outfits(config)]
             where = [f"dataset={root.name}", f"outfit={names[0]}", *data_root(root.parent)]
             return [root / name for name in names], [command_line("train", *where)]
-        case "data_convert":
+        case "data_convert" | "data_fit":
             where = [f"dataset={config.dataset}", f"outfit={result[0].name}", *data_root(config.data_root)]
             return result, [command_line("train", *where)]
         case "canonicalize":

@@ -16,6 +16,7 @@ from avatar.body.model import BodyModel
 from avatar.checks import DataError, plain_name, unknown_name
 from avatar.geometry.units import METRES
 from avatar.invocation import command_line, option
+from avatar.io.ledger import file_digest
 from avatar.io.raw_surface import RawSurface
 from avatar.records import Template
 
@@ -159,6 +160,10 @@ class Source(ABC):
     @abstractmethod
     def read(self, frame: SourceFrame) -> PosedScan:
         """A frame from its files."""
+
+    def made_of(self, frame: SourceFrame) -> list[str]:
+        """Hashes of all that a frame is made from but the body."""
+        return [file_digest(file) for file in frame.files]
 
     @property
     def body(self) -> BodyModel | None:

@@ -78,7 +78,7 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
     `DataError` naming the file for an invalid frame (unless these are skipped), scans without a fitted body, and
     an outfit that another source was converted to.
     """
-    folder = Path(config.data_root) / config.dataset / (config.name or source.name)
+    folder = converted_folder(source, config)
     outfit = SourceOutfit(source, config)
     with lock_folder(folder.parent / ".locks" / folder.name):
         _claim(folder, source)
@@ -88,8 +88,8 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
         bodies = {path.name: file_digest(path) for path in (*folder.glob("*.npz"), *folder.glob("*.obj"))}
         for frame in tracked(outfit.chosen, f"convert {source.name}"):
             path, label = folder / frame.split / f"{frame.name}.npz", f"{frame.split}/{frame.name}"
-            files = [file_digest(file) for file in frame.files]
-            key = keyed((*SOURCE, type(source).__module__), files=files, bodies=bodies, settings=settings)
+            made = source.made_of(frame)
+            key = keyed((*SOURCE, type(source).__module__), files=made, bodies=bodies, settings=settings)
             if ledger.find(label, key) is not None:
                 continue
             try:
@@ -111,6 +111,11 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
     for label, problem in failed.items():
         log.warning("convert: left out %s: %s", label, problem)
     return folder
+
+
+def converted_folder(source: Source, config: ConvertConfig) -> Path:
+    """The folder that an outfit is converted to."""
+    return Path(config.data_root) / config.dataset / (config.name or source.name)
 
 
 class SourceOutfit(PackedOutfit):
