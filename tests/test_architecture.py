@@ -36,6 +36,7 @@ LAYERS = {
     "nn": 3,
     "implicit": 3,
     "methods": 4,
+    "sources": 4,
     "training": 5,
     "export": 5,
     "evaluation": 5,
