@@ -78,7 +78,7 @@ def propagated_signs(axes: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarr
     tree = forest.tocoo()
     rows = np.concatenate([tree.row, np.full(pieces, count)])
     whole = coo_matrix((np.ones(len(rows)), (rows, np.concatenate([tree.col, roots]))), (count + 1, count + 1))
-    order, parents = breadth_first_order(whole.tocsr(), count, directed=False)
+    parents = breadth_first_order(whole.tocsr(), count, directed=False)[1]
     parents[roots] = roots
     own = np.einsum("mi,mi->m", axes, axes[parents[:count]])
     signs = np.where(own < 0, -1, 1)
