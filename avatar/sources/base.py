@@ -14,7 +14,7 @@ from avatar.body.model import BodyModel
 from avatar.checks import unknown_name
 from avatar.geometry.units import METRES
 from avatar.io.raw_surface import RawSurface
-from avatar.records import Template
+from avatar.records import Mesh, Template
 
 UPS = ("y", "z", "-y", "-z", "x", "-x")
 
@@ -117,6 +117,18 @@ class Source(ABC):
     @abstractmethod
     def read(self, frame: SourceFrame) -> PosedScan:
         """A frame from its files."""
+
+    def body_mesh(self, frame: SourceFrame) -> Mesh | None:
+        """The mesh of any body that was fitted to a frame's scan, metres, y up: what another body is fitted to.
+
+        None where the frame has none.
+        """
+        return None
+
+    @property
+    def decisions(self) -> dict[str, str]:
+        """What was found for all of the outfit's frames where its files do not say it, such as units and axes."""
+        return {}
 
     @property
     def body(self) -> BodyModel | None:

@@ -85,7 +85,7 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
         _claim(folder, source)
         write_body_files(folder, source)
         ledger, target, failed = Ledger(folder), PackedOutfit(folder), {}
-        settings = {key: getattr(config, key) for key in ("units", "up", "points")}
+        settings = {"points": config.points, **source.decisions}
         body = digest_of([file_digest(path) for path in sorted(folder.glob("*.npz")) + sorted(folder.glob("*.obj"))])
         for frame in tracked(frames, f"convert {source.name}"):
             path = folder / frame.split / f"{frame.name}.npz"
@@ -242,6 +242,7 @@ def _write_provenance(
         "source": str(source.path.resolve()),
         "layout": source.layout,
         "settings": settings_to_dict(config),
+        "decisions": source.decisions,
         "body": [str(path) for path in source.body_files],
         "frames": {
             f"{frame.split}/{frame.name}": {str(file): file_digest(file) for file in frame.files} for frame in frames

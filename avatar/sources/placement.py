@@ -119,15 +119,20 @@ def find_placement(
     height = float(np.median([robust_height(scan) for scan in scans]))
     found = (units,) if units != "auto" else possible_units(height)
     if not found:
-        problem = f"expected scans of people, got a height of {height:.4g} (median of {len(scans)}), a person's in no unit."
+        problem = (
+            f"expected scans of people, got a height of {height:.4g} (median of {len(scans)}), a person's in no unit."
+        )
         raise DataError(path, problem, "Hint: give units=m, cm, mm or in if it is right, or remove what is no person.")
     if fits and body is not None:
         placement = _fitted_placement(path, scans, found, up, fits, body)
     elif len(found) > 1:
-        raise DataError(path, f"expected one unit, a height of {height:.4g} is {_both_heights(height, found)}.", UNITS_HINT)
+        raise DataError(
+            path, f"expected one unit, a height of {height:.4g} is {_both_heights(height, found)}.", UNITS_HINT
+        )
     else:
         axis = up if up != "auto" else _standing_axis(path, scans, METRES[found[0]])
-        placement = Placement(METRES[found[0]], TURNS[axis], 1.0, TURNS[axis], {"units": found[0], "up": axis})
+        scale, turn = METRES[found[0]], TURNS[axis]
+        placement = Placement(scale, turn, scale, turn, {"units": found[0], "up": axis})
     words = ", ".join(f"{key} {value}" for key, value in placement.decided.items())
     log.info("%s: %s; height %.4g, median of %d scans. Give units=, up= if wrong.", path, words, height, len(scans))
     return placement
@@ -152,7 +157,9 @@ class _Relation:
 
     def __str__(self) -> str:
         as_is = "axes as they are" if self.turn == "y" else f"scans turned from {self.turn} up to y up"
-        return f"{self.covered:.0%} of the body covered with scans in {self.scan_unit}, fits in {self.fit_unit}, {as_is}"
+        return (
+            f"{self.covered:.0%} of the body covered with scans in {self.scan_unit}, fits in {self.fit_unit}, {as_is}"
+        )
 
 
 def _fitted_placement(
@@ -196,7 +203,9 @@ def _find_relation(
         height = float(np.median([robust_height(fit.free) for fit in fits]))
         fit_units = possible_units(height)
         if not fit_units:
-            raise DataError(path, f"expected fitted bodies of people, got a height of {height:.4g}.", "Hint: scale them.")
+            raise DataError(
+                path, f"expected fitted bodies of people, got a height of {height:.4g}.", "Hint: scale them."
+            )
     found: list[_Relation] = []
     for turn in turns:
         for scan_unit, fit_unit in product(scan_units, fit_units if whole else METRES):
@@ -240,7 +249,7 @@ def _measure(
 
 
 def _standing_axis(path: Path, scans: Sequence[np.ndarray], scale: float) -> str:
-    """The axis along which standing figures lie nearest to scans; `DataError` with the figures where two are as near."""
+    """The axis along which standing figures lie nearest to scans; `DataError` where two axes are as near."""
     figures, sums = _standing_figures(), dict.fromkeys(TURNS, 0.0)
     for scan in scans:
         points, size = _normalised(scan, SCAN_POINTS)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
-import re
-import zipfile
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,31 +14,31 @@ from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.body.packed import holds_template
 from avatar.body.registry import body_of_file
 from avatar.body.solving import posed_vertices, solve_poses
-from avatar.checks import AvatarError, DataError, plain_name
-from avatar.data.folders import SPLITS
+from avatar.checks import DataError, plain_name
 from avatar.invocation import command_line, option
-from avatar.io.amass import KEYS, SmplArrays, read_betas, read_smpl_arrays
-from avatar.io.documents import read_json_record
+from avatar.io.amass import SmplArrays, read_betas, read_smpl_arrays
 from avatar.io.joint_names import INDEX, map_joints
 from avatar.io.motions import move_body
 from avatar.io.npz import read_arrays
+from avatar.io.rigs import RIG_SUFFIXES
 from avatar.io.surfaces import READERS, read_surface
 from avatar.records import Mesh, Motion
-from avatar.sources.base import PosedScan, Source, SourceConfig, SourceFrame
+from avatar.sources.base import PosedScan, Source, SourceFrame
+from avatar.sources.listing import (
+    ARRAYS,
+    BODY_STEMS,
+    PASSED,
+    VERTEX_KEYS,
+    ScanFolder,
+    array_kind,
+    is_fit_folder,
+    list_folders,
+    list_frames,
+    own_stem,
+    visible,
+)
 from avatar.sources.placement import FittedSample, Placement, StandingBody, find_placement
 
-ARRAYS = (".npz", ".json")
-PASSED = {  # endings of what belongs to scans and is not read: materials, buffers, textures, notes
-    *(".mtl", ".bin", ".png", ".jpg", ".jpeg", ".tga", ".bmp", ".tif", ".tiff", ".exr", ".webp", ".dds", ".ktx2"),
-    *(".txt", ".md", ".pdf", ".html", ".yaml", ".yml", ".csv", ".log", ".ini", ".db", ".blend"),
-}
-FIT_FOLDERS = ("body", "bodies", "fit", "fits", "smpl", "smplh", "smplx", "params", "minimal")
-BODY_STEMS = ("body", "template")
-FIT_WORD = r"(?:body|smplh?|smplx|fit|fitted|minimal|params?|poses?|mesh)"
-FIT_ENDING = re.compile(rf"[._-]{FIT_WORD}(?:[._-]{FIT_WORD})*$", re.IGNORECASE)
-NUMBERED = re.compile(r"^(.*?)(\d+)$")
-VERTEX_KEYS = ("vertices", "verts", "body_verts", "v")
-FEWEST_IN_SEQUENCE = 3  # scans in one folder whose names differ in their number alone
 SAMPLES = 8  # frames from which units and axes are found
 SAMPLE_POINTS = 20_000  # of each scan
 SHAPE_SAMPLES = 16  # files that shape coefficients are read from
@@ -51,24 +48,13 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class _Fit:
+class Fit:
     """Where one frame's body is: a file, and the frame's place in it where it holds all of a folder's."""
 
     path: Path
     kind: str  # parameters, vertices or mesh
-    place: int | None = None
-    count: int = 1
-
-
-@dataclass(frozen=True)
-class _Folder:
-    """One folder of scans: the split and the sequence that its place says, empty where it says none."""
-
-    path: Path
-    split: str
-    sequence: str
-    scans: tuple[Path, ...]
-    others: tuple[Path, ...]
+    place: int = 0
+    count: int = 1  # frames that the file must have
 
 
 class PlainScans(Source):
@@ -87,18 +73,18 @@ class PlainScans(Source):
     def find(cls, path: Path) -> dict[str, Path]:
         """The folder itself as one outfit where it or its sub-folders hold scans; empty elsewhere."""
         path = Path(path)
-        return {plain_name(path.resolve().name, "scans"): path} if any(_folders(path, SourceConfig())) else {}
+        holds = any(folder.scans for folder in list_folders(path))
+        return {plain_name(path.resolve().name, "scans"): path} if holds else {}
 
     @cached_property
     def frames(self) -> tuple[SourceFrame, ...]:
         """Frames sorted by split, sequence and number. Raises `DataError` for two scans of one name."""
-        found = sorted(self._scans, key=lambda frame: (frame.split, frame.sequence, frame.number))
-        unknown = sorted({path.suffix.lower() or path.name for path in self._unknown})
-        if unknown:
-            log.warning("%s: %d files of unknown kinds are left out: %s.", self.path, len(self._unknown), ", ".join(unknown))
+        if unknown := self._unknown:
+            kinds = ", ".join(sorted({path.suffix.lower() or path.name for path in unknown}))
+            log.warning("%s: %d files of unknown kinds are left out: %s.", self.path, len(unknown), kinds)
         return tuple(
-            replace(frame, files=(*frame.files, *dict.fromkeys(fit.path for fit in self._fits.get(frame.name, ()))))
-            for frame in found
+            replace(frame, files=(*frame.files, *dict.fromkeys(fit.path for fit in self._fits[frame.name])))
+            for frame in self._scans
         )
 
     @cached_property
@@ -127,7 +113,7 @@ class PlainScans(Source):
         surface, placement = read_surface(frame.files[0]), self._placement
         normals = None if surface.normals is None else placement.normals(surface.normals)
         posed = PosedScan(replace(surface, vertices=placement.scan(surface.vertices), normals=normals))
-        for fit in self._fits.get(frame.name, ()) if self.body is not None else ():
+        for fit in self._fits[frame.name] if self.body is not None else ():
             if fit.kind == "parameters":
                 pose, translation = self._parameters(fit)
                 pose, translation = placement.pose(pose, translation, self._pelvis)
@@ -138,122 +124,122 @@ class PlainScans(Source):
             return posed
         solved = solve_poses(self.body, posed.vertices[None])
         if solved.residuals[0] > FOREIGN:
-            problem = f"expected the body in some pose, its mesh is {1000 * solved.residuals[0]:.0f} mm from the nearest."
+            apart = 1000 * solved.residuals[0]
+            problem = f"expected the body in some pose, got a mesh {apart:.0f} mm from the nearest."
             raise DataError(frame.files[-1], problem, "Hint: give the shape that was fitted (body.betas), or its body.")
         return replace(posed, pose=solved.poses[0], translation=solved.translations[0])
 
     def body_mesh(self, frame: SourceFrame) -> Mesh | None:
         """The mesh that was fitted to a scan, of any model, in metres, y up; None where the frame has no such file."""
-        fit = next((fit for fit in self._fits.get(frame.name, ()) if fit.kind == "mesh"), None)
+        fit = next((fit for fit in self._fits[frame.name] if fit.kind == "mesh"), None)
         if fit is None:
             return None
         mesh = read_surface(fit.path).mesh
         return replace(mesh, vertices=self._placement.fit(mesh.vertices))
 
     @cached_property
-    def _all_folders(self) -> list[_Folder]:
-        folders = list(_folders(self.path, self.config))
-        splits = {folder.split for folder in folders}
-        if "" in splits and len(splits) > 1:
-            stray = next(folder for folder in folders if not folder.split)
-            problem = f"expected scans in {', '.join(sorted(splits - {''}))} alone, there are some in {stray.path} too."
-            raise DataError(self.path, problem, "Hint: move them.")
-        return folders
+    def _folders(self) -> list[ScanFolder]:
+        return list_folders(self.path, self.config.fits)
 
     @cached_property
     def _scans(self) -> list[SourceFrame]:
-        """The frames without the files of their bodies; what is shared by a folder is in its order."""
-        frames = [frame for folder in self._all_folders for frame in _folder_frames(folder)]
-        names: dict[str, Path] = {}
-        for frame in frames:
-            other = names.setdefault(frame.name.lower(), frame.files[0])
-            if other != frame.files[0]:
-                problem = f"expected scans of different names, this one and {other} would both be {frame.name}."
-                raise DataError(frame.files[0], problem, "Hint: rename one, or move one out of the folder.")
-        return frames
+        """The frames without the files of their bodies."""
+        return list_frames(self._folders)
+
+    @cached_property
+    def _fit_files(self) -> dict[Path, None]:
+        """Files of ``fits``, or of folders such as smpl/ beside the scans."""
+        roots = [self.config.fits]
+        if self.config.fits is None:
+            roots = [path for path in visible(self.path) if path.is_dir() and is_fit_folder(path)]
+        elif not self.config.fits.exists():
+            raise DataError(self.config.fits, "fits: expected a file or a folder, there is none.")
+        files: list[Path] = []
+        while roots:
+            root = roots.pop(0)
+            files += [root] if root.is_file() else []
+            roots += visible(root) if root.is_dir() else []
+        return dict.fromkeys(files)
 
     @cached_property
     def _arrays(self) -> dict[Path, str]:
-        """Kinds of the npz and JSON files among all others: parameters, vertices, body; others are left out."""
-        found = {}
-        for path in dict.fromkeys([*(p for folder in self._all_folders for p in folder.others), *self._fit_files]):
-            if path.suffix.lower() in ARRAYS and (kind := _array_kind(path)):
-                found[path] = kind
-        return found
+        """Kinds of the npz and JSON files: parameters, vertices, body; those that hold nothing of it are left out."""
+        others = [path for folder in self._folders for path in folder.others]
+        found = [path for path in dict.fromkeys([*others, *self._fit_files]) if path.suffix.lower() in ARRAYS]
+        return {path: kind for path in found if (kind := array_kind(path))}
 
     @cached_property
-    def _fit_files(self) -> list[Path]:
-        """Files of ``fits``, or of folders such as smpl/ beside the scans."""
-        roots = [self.config.fits] if self.config.fits else [
-            path for path in _children(self.path) if path.is_dir() and path.name.lower() in FIT_FOLDERS
-        ]  # fmt: skip
-        files: list[Path] = []
-        for root in roots:
-            if not root.exists():
-                raise DataError(root, "fits: expected a file or a folder, there is none.")
-            files += [root] if root.is_file() else [path for path in sorted(root.rglob("*"), key=_natural) if path.is_file()]
-        return [path for path in files if not _hidden(path.name)]
+    def _fits(self) -> dict[str, tuple[Fit, ...]]:
+        """What says how each frame's body lies, by the frame's name: at most one file of each kind."""
+        found: dict[str, dict[str, Fit]] = {frame.name: {} for frame in self._scans}
 
-    @cached_property
-    def _fits(self) -> dict[str, tuple[_Fit, ...]]:
-        """The files that say how each frame's body lies, by the frame's name."""
-        found: dict[str, list[_Fit]] = {frame.name: [] for frame in self._scans}
-        beside = {folder.path: folder.others for folder in self._all_folders}
-        taken: set[Path] = set()
+        def add(frame: SourceFrame, fit: Fit) -> None:
+            other = found[frame.name].setdefault(fit.kind, fit)
+            if other.path != fit.path:
+                problem = f"expected one file of body {fit.kind} for {frame.files[0]}, {other.path} is another."
+                raise DataError(fit.path, problem, "Hint: give fits=.")
+
+        owned: set[Path] = set()
         for frame in self._scans:
-            scan = frame.files[0]
-            own = [*beside[scan.parent], *self._fits_below(scan)]
-            kinds: dict[str, Path] = {}
-            for path in own:
-                if path == scan or not _belongs(path, scan):
-                    continue
-                kind = "mesh" if path.suffix.lower() in READERS else self._arrays.get(path)
-                if kind in ("parameters", "vertices", "mesh"):
-                    if (other := kinds.setdefault(kind, path)) != path:
-                        raise DataError(path, f"expected one file of body {kind} for {scan.name}, {other} is another.")
-                    taken.add(path)
-                    found[frame.name].append(_Fit(path, kind))
+            for path in self._candidates(frame.files[0]):
+                kind = "mesh" if path.suffix.lower() in READERS else self._arrays.get(path, "body")
+                if kind != "body":
+                    owned.add(path)
+                    add(frame, Fit(path, kind))
         for path, kind in self._arrays.items():
-            if kind != "body" and path not in taken:
+            if kind != "body" and path not in owned:
                 frames = self._covered(path)
                 for place, frame in enumerate(frames):
-                    if any(fit.kind == kind for fit in found[frame.name]):
-                        other = next(fit.path for fit in found[frame.name] if fit.kind == kind)
-                        raise DataError(path, f"expected one file of body {kind} for {frame.name}, {other} is another.")
-                    found[frame.name].append(_Fit(path, kind, place, len(frames)))
-        return {name: tuple(fits) for name, fits in found.items()}
+                    add(frame, Fit(path, kind, place, len(frames)))
+        return {name: tuple(fits.values()) for name, fits in found.items()}
 
-    def _fits_below(self, scan: Path) -> list[Path]:
-        """Files of the fits' folders that may belong to a scan: those of a folder like its own, where there is one."""
+    def _candidates(self, scan: Path) -> list[Path]:
+        """Files of a scan's name: beside it, unless ``fits`` are given, and of the fits' folder like its own.
+
+        Folders of fits are ordered as those of scans are, or all in one.
+        """
+        found = [path for key in {scan.stem.lower(), own_stem(scan)} for path in self._named.get(key, ())]
         inner = scan.parent.relative_to(self.path).parts
-        return [path for path in self._fit_files if not inner or path.parent.parts[-len(inner) :] == inner] or (
-            self._fit_files if len(self._all_folders) == 1 else []
-        )
+        beside = [path for path in found if path.parent == scan.parent and self.config.fits is None]
+        apart = [path for path in found if path in self._fit_files]
+        alike = [path for path in apart if inner and path.parent.parts[-len(inner) :] == inner]
+        alone = sum(bool(folder.scans) for folder in self._folders) == 1
+        return beside + (alike or (apart if alone else []))
+
+    @cached_property
+    def _named(self) -> dict[str, list[Path]]:
+        """Files that may be about single scans by the names that these may have."""
+        found: dict[str, list[Path]] = {}
+        others = [path for folder in self._folders for path in folder.others]
+        for path in dict.fromkeys([*others, *self._fit_files]):
+            for key in dict.fromkeys((path.stem.lower(), own_stem(path))):
+                found.setdefault(key, []).append(path)
+        return found
 
     def _covered(self, path: Path) -> list[SourceFrame]:
-        """The frames, in order, that one file of all frames is about: those of its folder, or of the folder so named."""
-        folders = [folder for folder in self._all_folders if path in folder.others and folder.scans]
-        folders = folders or [folder for folder in self._all_folders if folder.path.name.lower() == path.stem.lower()]
-        folders = folders or [folder for folder in self._all_folders if folder.scans]
+        """The frames, in order, that one file of many is about: those of its folder, or of the folder of its name."""
+        scanned = [folder for folder in self._folders if folder.scans]
+        folders = [folder for folder in scanned if path in folder.others]
+        folders = folders or [folder for folder in scanned if folder.path.name.lower() == path.stem.lower()] or scanned
         if len(folders) != 1:
-            problem = f"expected a file for one folder of scans, there are {len(folders)}."
-            raise DataError(path, problem, "Hint: put one such file into each folder of scans, or name it as the folder.")
-        scans = {scan: place for place, scan in enumerate(folders[0].scans)}
-        return sorted((f for f in self._scans if f.files[0] in scans), key=lambda frame: scans[frame.files[0]])
+            problem = f"expected a file about one folder of scans, there are {len(folders)}."
+            raise DataError(path, problem, "Hint: put such a file into each folder of scans, or name it as the folder.")
+        of = {frame.files[0]: frame for frame in self._scans}
+        return [of[scan] for scan in folders[0].scans]
 
     @cached_property
     def _unknown(self) -> list[Path]:
         """Files that are nothing that is read, passed over or part of the body."""
         known = {fit.path for fits in self._fits.values() for fit in fits} | set(self._arrays) | set(self.body_files)
-        others = [path for folder in self._all_folders for path in folder.others]
+        others = [path for folder in self._folders for path in folder.others]
         return [path for path in others if path not in known and path.suffix.lower() not in PASSED]
 
     @cached_property
     def _body_file(self) -> Path | None:
         if self.config.body.path is not None:
             return self.config.body.path
-        files = [*_children(self.path), *self._fit_files]
-        stems = [path for path in files if path.stem.lower() in BODY_STEMS and path.suffix.lower() in (".glb", ".gltf")]
+        files = [*(path for folder in self._folders for path in folder.others), *self._fit_files]
+        stems = [path for path in files if path.stem.lower() in BODY_STEMS and path.suffix.lower() in RIG_SUFFIXES]
         found = list(dict.fromkeys([*(path for path, kind in self._arrays.items() if kind == "body"), *stems]))
         if len(found) > 1:
             raise DataError(found[1], f"expected one body, {found[0]} is another.", "Hint: give body.path=.")
@@ -267,7 +253,7 @@ class PlainScans(Source):
     def _betas(self) -> list[float]:
         """Shape coefficients of the parameters, the mean over the frames; empty where they have none."""
         files = list(dict.fromkeys(f.path for fits in self._fits.values() for f in fits if f.kind == "parameters"))
-        some = [files[place] for place in np.unique(np.linspace(0, len(files) - 1, SHAPE_SAMPLES).astype(int))] if files else []
+        some = _some(files, SHAPE_SAMPLES)
         shapes = [betas for path in some if (betas := read_betas(path)) is not None]
         if not shapes:
             return []
@@ -282,24 +268,24 @@ class PlainScans(Source):
     def _pelvis(self) -> np.ndarray:
         return self.body.zero_joints[0].double().cpu().numpy()
 
-    def _parameters(self, fit: _Fit) -> tuple[np.ndarray, np.ndarray]:
+    def _parameters(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(J, 3)`` of the body's joints and translation ``(3,)`` of a frame, as stored."""
         arrays = self._read_once(fit.path)
         _check_count(fit, len(arrays.poses))
-        pose, translation = arrays.poses[fit.place or 0], arrays.translations[fit.place or 0]
+        pose, translation = arrays.poses[fit.place], arrays.translations[fit.place]
         if list(self.body.joint_names[: len(SMPL_JOINTS)]) != SMPL_JOINTS:
             motion = Motion(pose[None], translation[None], 1.0, fit.path.stem)
             pose = move_body(motion, self.body).poses[0]
         return pose, translation
 
-    def _vertices(self, fit: _Fit) -> np.ndarray:
+    def _vertices(self, fit: Fit) -> np.ndarray:
         """Posed vertices ``(V, 3)`` of a frame, as stored, which must be the body's."""
         if fit.kind == "mesh":
             vertices = read_surface(fit.path).vertices
         else:
             arrays = self._read_once(fit.path)
             _check_count(fit, len(arrays))
-            vertices = arrays[fit.place or 0]
+            vertices = arrays[fit.place]
         if len(vertices) != (expected := len(self.body.bind_vertices)):
             problem = f"expected the {expected} vertices of the body, got {len(vertices)}."
             line = command_line("data_fit", option("source", self.path))
@@ -322,22 +308,17 @@ class PlainScans(Source):
     @cached_property
     def _placement(self) -> Placement:
         """Units and axes, found from frames spread evenly over the outfit."""
-        frames = self._scans
-        frames = [frames[place] for place in np.unique(np.linspace(0, len(frames) - 1, SAMPLES).astype(int))]
         scans, fits, known = [], [], None
-        for frame in frames:
-            points = read_surface(frame.files[0]).vertices
-            scans.append(points[np.linspace(0, len(points) - 1, min(len(points), SAMPLE_POINTS)).astype(int)])
-            if self.body is not None and self._fits.get(frame.name):
+        for frame in _some(self._scans, SAMPLES):
+            scans.append(_some(read_surface(frame.files[0]).vertices, SAMPLE_POINTS))
+            if self.body is not None and self._fits[frame.name]:
                 fits.append((len(scans) - 1, self._sample(self._fits[frame.name][-1])))
         if fits:
             scans = [scans[place] for place, _ in fits]
             known = _standing_body(self.body)
-        return find_placement(
-            self.path, scans, self.config.units, self.config.up, [fit for _, fit in fits], known
-        )
+        return find_placement(self.path, scans, self.config.units, self.config.up, [fit for _, fit in fits], known)
 
-    def _sample(self, fit: _Fit) -> FittedSample:
+    def _sample(self, fit: Fit) -> FittedSample:
         """A frame's posed body, with what the file's unit scales apart."""
         if fit.kind != "parameters":
             vertices = self._vertices(fit).astype(np.float64)
@@ -347,25 +328,33 @@ class PlainScans(Source):
         return FittedSample(vertices, np.broadcast_to(translation.astype(np.float64), vertices.shape))
 
 
-def _folders(path: Path, config: SourceConfig) -> Iterator[_Folder]:
-    """Folders of scans in natural order: the folder itself, its splits, its sequences and their splits' sequences."""
+def _some(items: Any, most: int) -> Any:
+    """At most so many of a list or an array's rows, evenly."""
+    places = np.unique(np.linspace(0, len(items) - 1, min(len(items), most)).astype(int))
+    return items[places] if isinstance(items, np.ndarray) else [items[place] for place in places]
 
-    def visit(folder: Path, split: str, sequence: str, depth: int) -> Iterator[_Folder]:
-        children = _children(folder)
-        files = [child for child in children if child.is_file()]
-        scans = _scan_files(files)
-        if scans or depth == 0:
-            others = tuple(file for file in files if file not in scans)
-            if scans:
-                yield _Folder(folder, split, sequence, tuple(scans), others)
-            elif others and any(True for _ in itertools.chain.from_iterable(inner for inner in [])):
-                yield _Folder(folder, split, sequence, (), others)
-        for child in children:
-            if not child.is_dir() or child.name.lower() in FIT_FOLDERS or _is_same(child, config.fits):
-                continue
-            if not split and not sequence and child.name.lower() in SPLITS:
-                yield from visit(child, child.name.lower(), "", depth + 1)
-            elif not sequence:
-                yield from visit(child, split, child.name, depth + 1)
 
-    yield from visit(Path(path), "", "", 0)
+def _check_count(fit: Fit, count: int) -> None:
+    """Refuses a file of another number of frames than its folder has scans."""
+    if count != fit.count:
+        problem = f"expected {fit.count} frames, one a scan, got {count}."
+        raise DataError(fit.path, problem, "Hint: leave the others out.")
+
+
+def _read_vertices(path: Path) -> np.ndarray:
+    """Posed vertices ``(T, V, 3)`` of an npz."""
+    found = read_arrays(path, {}, {key: f"number T{key} V{key} 3 | V{key} 3" for key in VERTEX_KEYS})
+    vertices = next(found[key] for key in VERTEX_KEYS if key in found)
+    return vertices if vertices.ndim == 3 else vertices[None]
+
+
+def _standing_body(body: BodyModel) -> StandingBody:
+    """A body's faces, and the shares of its ankles and its shoulders, by the joints' weights."""
+    joints, weights = map_joints(body.joint_names, body.parents), body.weights.double().cpu().numpy()
+
+    def share(*names: str) -> np.ndarray:
+        of = weights[:, [joints[INDEX[name]] for name in names if INDEX[name] in joints]].sum(axis=1)
+        return of / of.sum()
+
+    low = share("left_ankle", "right_ankle", "left_knee", "right_knee")
+    return StandingBody(body.faces.cpu().numpy(), low, share("left_shoulder", "right_shoulder"))

@@ -6,8 +6,10 @@ from pathlib import Path
 
 from avatar.checks import AvatarError, DataError, did_you_mean, sentences, unknown_name
 from avatar.sources.base import Source, SourceConfig
+from avatar.sources.plain import PlainScans
 
-LAYOUTS: dict[str, type[Source]] = {}  # in the order in which they are looked for; plain folders last
+# in the order in which they are looked for; plain folders last
+LAYOUTS: dict[str, type[Source]] = {kind.layout: kind for kind in (PlainScans,)}
 
 
 def open_sources(config: SourceConfig) -> list[Source]:
