@@ -125,7 +125,7 @@ def _metres(path: Path, height: float) -> float:
         return 1.0
     units = possible_units(height)
     if len(units) != 1:
-        found = f"it may be in {' or '.join(units)}" if units else "a person in no unit"
+        found = " or ".join(f"{height * METRES[unit]:.2f} m in {unit}" for unit in units) or "a person's in no unit"
         raise DataError(path, f"expected a person in metres, got a height of {height:.4g}: {found}.", "Hint: scale it.")
     log.warning("%s: height %.4g, which is taken for %s: scaled to metres.", path, height, units[0])
     return METRES[units[0]]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 
@@ -84,12 +86,12 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
     with lock_folder(folder):
         _claim(folder, source)
         write_body_files(folder, source)
-        ledger, target, failed = Ledger(folder), PackedOutfit(folder), {}
+        ledger, target, failed, digest = Ledger(folder), PackedOutfit(folder), {}, cache(file_digest)
         settings = {"points": config.points, **source.decisions}
         body = digest_of([file_digest(path) for path in sorted(folder.glob("*.npz")) + sorted(folder.glob("*.obj"))])
         for frame in tracked(frames, f"convert {source.name}"):
             path = folder / frame.split / f"{frame.name}.npz"
-            key = keyed(SOURCE, files=[file_digest(file) for file in frame.files], body=body, settings=settings)
+            key = keyed(SOURCE, files=[digest(file) for file in frame.files], body=body, settings=settings)
             label = f"{frame.split}/{frame.name}"
             if ledger.find(label, key) is not None:
                 continue
@@ -112,7 +114,7 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
                 source.path, f"expected valid frames, all {len(frames)} are invalid. {next(iter(failed.values()))}"
             )
         _drop_others(folder, {f"{frame.split}/{frame.name}" for frame in frames} - failed.keys())
-        _write_provenance(folder, source, config, frames, failed)
+        _write_provenance(folder, source, config, frames, failed, digest)
         write_manifest(folder)
     for label, problem in failed.items():
         log.warning("convert: left out %s: %s", label, problem)
@@ -234,7 +236,12 @@ def _drop_others(folder: Path, kept: set[str]) -> None:
 
 
 def _write_provenance(
-    folder: Path, source: Source, config: ConvertConfig, frames: list[SourceFrame], failed: dict[str, str]
+    folder: Path,
+    source: Source,
+    config: ConvertConfig,
+    frames: list[SourceFrame],
+    failed: dict[str, str],
+    digest: Callable[[Path], str],
 ) -> None:
     """Writes ``source.json``: layout, settings, and the files and hashes that each frame was made from."""
     record = {
@@ -245,7 +252,7 @@ def _write_provenance(
         "decisions": source.decisions,
         "body": [str(path) for path in source.body_files],
         "frames": {
-            f"{frame.split}/{frame.name}": {str(file): file_digest(file) for file in frame.files} for frame in frames
+            f"{frame.split}/{frame.name}": {str(file): digest(file) for file in frame.files} for frame in frames
         },
         "left_out": failed,
     }

@@ -56,8 +56,9 @@ def list_folders(path: Path, fits: Path | None = None) -> list[ScanFolder]:
         meshes = [file for file in files if file.suffix.lower() in READERS]
         stems = {mesh.stem.lower() for mesh in meshes}
         scans = tuple(mesh for mesh in meshes if not _is_body(mesh, stems))
-        others = tuple(dict.fromkeys(files).keys() - set(scans))
-        folders.append(ScanFolder(folder, split, sequence, scans, tuple(sorted(others, key=natural))))
+        known = set(scans)
+        others = tuple(file for file in files if file not in known)
+        folders.append(ScanFolder(folder, split, sequence, scans, others))
         for child in children:
             if not child.is_dir() or is_fit_folder(child) or (fits is not None and child.samefile(fits)):
                 continue

@@ -172,6 +172,8 @@ def _fitted_placement(
 ) -> Placement:
     """The placement under which scans lie over their fitted bodies."""
     best = _find_relation(path, scans, scan_units, up, fits, body)
+    if best.turn != "y" or best.scan_unit != best.fit_unit:
+        log.warning("%s: scans and fits differ: %s.", path, best)
     bodies = [fit.vertices(best.fit_unit) for fit in fits]
     mean = np.mean([body.upright(vertices) for vertices in bodies], axis=0)
     shares = {axis: float(mean @ turn[1]) for axis, turn in TURNS.items()}
@@ -227,7 +229,6 @@ def _find_relation(
     if others:
         problem = f"expected one reading of units and axes, got two: {best}; {others[0]}."
         raise DataError(path, problem, "Hint: give units= and up=.")
-    log.warning("%s: scans and fits differ: %s.", path, best)
     return best
 
 
