@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -146,20 +146,19 @@ def _both_heights(height: float, units: Sequence[str]) -> str:
 
 
 @dataclass(frozen=True)
-class _Relation:
-    """Units of scans and fits, and which of the scans' axes points where y does in the fits' frame."""
+class _Reading:
+    """Units and up axes of scans and fits, and how scans lie over their bodies if so read."""
 
     scan_unit: str
+    scan_up: str
     fit_unit: str
-    turn: str
+    fit_up: str
     covered: float
     buried: float
 
     def __str__(self) -> str:
-        as_is = "axes as they are" if self.turn == "y" else f"scans turned from {self.turn} up to y up"
-        return (
-            f"{self.covered:.0%} of the body covered with scans in {self.scan_unit}, fits in {self.fit_unit}, {as_is}"
-        )
+        read = f"scans in {self.scan_unit} with {self.scan_up} up, fits in {self.fit_unit} with {self.fit_up} up"
+        return f"{self.covered:.0%} of the body covered with {read}"
 
 
 def _fitted_placement(
@@ -171,82 +170,76 @@ def _fitted_placement(
     body: StandingBody,
 ) -> Placement:
     """The placement under which scans lie over their fitted bodies."""
-    best = _find_relation(path, scans, scan_units, up, fits, body)
-    if best.turn != "y" or best.scan_unit != best.fit_unit:
-        log.warning("%s: scans and fits differ: %s.", path, best)
-    bodies = [fit.vertices(best.fit_unit) for fit in fits]
-    mean = np.mean([body.upright(vertices) for vertices in bodies], axis=0)
+    mean = np.mean([body.upright(fit.vertices("m")) for fit in fits], axis=0)  # whatever the unit
     shares = {axis: float(mean @ turn[1]) for axis, turn in TURNS.items()}
     stands = max(shares, key=shares.get)
-    axis = stands if up == "auto" else up if best.turn == "y" else "y"
-    if shares[axis] < UPRIGHT:
-        figure = f"bodies stand along {stands} ({shares[stands]:.2f} of 1 from ankles to shoulders, over the frames)"
-        if up == "auto":
-            raise DataError(path, f"expected bodies upright along an axis, at most {figure}.", "Hint: give up=.")
+    figure = f"bodies stand along {stands} ({shares[stands]:.2f} of 1 from ankles to shoulders, over the frames)"
+    if up == "auto" and shares[stands] < UPRIGHT:
+        raise DataError(path, f"expected bodies upright along an axis, at most {figure}.", "Hint: give up=.")
+    if up == "auto":
+        ups = [(axis, stands) for axis in dict.fromkeys((stands, *TURNS))]
+    else:
+        ups = list(dict.fromkeys([(up, up), (up, stands)]))
+    best = _find_reading(path, scans, scan_units, ups, fits, body)
+    if shares[best.fit_up] < UPRIGHT:
         log.warning("%s: up=%s as it was given, but %s.", path, up, figure)
-    decided = {"units": best.scan_unit, "up": axis if best.turn == "y" else best.turn}
-    decided |= {"fit units": best.fit_unit, "fit up": axis, "covered": f"{best.covered:.2f}"}
-    turn = TURNS[axis]
-    return Placement(METRES[best.scan_unit], turn @ TURNS[best.turn], METRES[best.fit_unit], turn, decided)
+    if (best.scan_unit, best.scan_up) != (best.fit_unit, best.fit_up):
+        log.warning("%s: scans and fits differ: %s.", path, best)
+    decided = {"units": best.scan_unit, "up": best.scan_up, "fit units": best.fit_unit, "fit up": best.fit_up}
+    turns = TURNS[best.scan_up], TURNS[best.fit_up]
+    return Placement(METRES[best.scan_unit], turns[0], METRES[best.fit_unit], turns[1], decided)
 
 
-def _find_relation(
+def _find_reading(
     path: Path,
     scans: Sequence[np.ndarray],
     scan_units: Sequence[str],
-    up: str,
+    ups: Sequence[tuple[str, str]],
     fits: Sequence[FittedSample],
     body: StandingBody,
-) -> _Relation:
-    """The units and axes under which scans cover most of their bodies; `DataError` for none, or two."""
-    turns = list(TURNS) if up == "auto" else list(dict.fromkeys(("y", up)))
-    whole = not any(fit.fixed.any() for fit in fits)
-    if whole:
+) -> _Reading:
+    """The units, and the up axes among pairs, under which scans cover most of their bodies; the first pair is that of
+    one frame for both. `DataError` where none does, or two do.
+    """
+    meshes = not any(fit.fixed.any() for fit in fits)
+    fit_units: tuple[str, ...] = ()
+    if meshes:
         height = float(np.median([robust_height(fit.free) for fit in fits]))
-        fit_units = possible_units(height)
-        if not fit_units:
-            raise DataError(
-                path, f"expected fitted bodies of people, got a height of {height:.4g}.", "Hint: scale them."
-            )
-    found: list[_Relation] = []
-    for turn in turns:
-        for scan_unit, fit_unit in product(scan_units, fit_units if whole else METRES):
-            if not whole and fit_unit not in ("m", scan_unit):
-                continue
-            relation = _measure(scans, fits, body, scan_unit, fit_unit, turn)
-            if relation.covered >= CLEAR and relation.buried <= CLEAR_BURIED:
-                return relation
-            found.append(relation)
-    found.sort(key=lambda relation: relation.buried - relation.covered)
-    best = found[0]
-    others = [other for other in found[1:] if other.covered - other.buried > best.covered - best.buried - APART]
+        if not (fit_units := possible_units(height)):
+            problem = f"expected fitted bodies of people, got a height of {height:.4g}."
+            raise DataError(path, problem, "Hint: scale them.")
+    found: list[_Reading] = []
+    for (scan_up, fit_up), scan_unit in product(ups, scan_units):
+        for fit_unit in fit_units or dict.fromkeys(("m", scan_unit)):
+            reading = _measure(scans, fits, body, _Reading(scan_unit, scan_up, fit_unit, fit_up, 0, 0))
+            if reading.covered >= CLEAR and reading.buried <= CLEAR_BURIED:
+                return reading
+            found.append(reading)
+    as_is, *_ = found
+    best, *others = sorted(found, key=lambda reading: reading.buried - reading.covered)
+    near = [other for other in others if other.covered - other.buried > best.covered - best.buried - APART]
     if best.covered < COVERED or best.buried > BURIED:
-        as_is = next(relation for relation in found if relation.turn == "y")
         problem = f"expected scans over their fitted bodies, got {as_is}; at best {best}."
-        points = METRES[as_is.scan_unit] * scans[0].astype(np.float64)
-        hint = suggest_hint(points, np.zeros_like(points), fits[0].vertices(as_is.fit_unit), body.faces)
-        raise DataError(path, problem, hint)
-    if others:
-        problem = f"expected one reading of units and axes, got two: {best}; {others[0]}."
+        points = METRES[as_is.scan_unit] * (scans[0].astype(np.float64) @ TURNS[as_is.scan_up].T)
+        vertices = fits[0].vertices(as_is.fit_unit) @ TURNS[as_is.fit_up].T
+        raise DataError(path, problem, suggest_hint(points, np.zeros_like(points), vertices, body.faces))
+    if near:
+        problem = f"expected one reading of units and axes, got two: {best}; {near[0]}."
         raise DataError(path, problem, "Hint: give units= and up=.")
     return best
 
 
 def _measure(
-    scans: Sequence[np.ndarray],
-    fits: Sequence[FittedSample],
-    body: StandingBody,
-    scan_unit: str,
-    fit_unit: str,
-    turn: str,
-) -> _Relation:
-    """How scans lie over their bodies under one reading, the mean over the frames."""
+    scans: Sequence[np.ndarray], fits: Sequence[FittedSample], body: StandingBody, reading: _Reading
+) -> _Reading:
+    """The reading with how scans lie over their bodies, the mean over the frames."""
     overlaps = []
     for scan, fit in zip(scans, fits):
-        points = METRES[scan_unit] * (scan.astype(np.float64) @ TURNS[turn].T)
-        overlaps.append(measure_overlap(points, np.zeros_like(points), fit.vertices(fit_unit), body.faces))
+        points = METRES[reading.scan_unit] * (scan.astype(np.float64) @ TURNS[reading.scan_up].T)
+        vertices = fit.vertices(reading.fit_unit) @ TURNS[reading.fit_up].T
+        overlaps.append(measure_overlap(points, np.zeros_like(points), vertices, body.faces))
     covered, buried = (float(np.mean([getattr(o, key) for o in overlaps])) for key in ("covered", "buried"))
-    return _Relation(scan_unit, fit_unit, turn, covered, buried)
+    return replace(reading, covered=covered, buried=buried)
 
 
 def _standing_axis(path: Path, scans: Sequence[np.ndarray], scale: float) -> str:

@@ -69,7 +69,7 @@ def test_units(body, rig, tmp_path, caplog):
     assert_same_body(rigged_body(write_rig(tmp_path / "b.glb", scaled)), body)
     assert "taken for cm" in caplog.text
     child = replace(rig, vertices=40 * rig.vertices, joints=40 * rig.joints)
-    with pytest.raises(DataError, match="height of 70.7.* 1.80 m in in or 0.71 m in cm"):
+    with pytest.raises(DataError, match=r"height of 70\.7.* 1\.80 m in in or 0\.71 m in cm"):
         rigged_body(write_rig(tmp_path / "c.glb", child))
 
 
