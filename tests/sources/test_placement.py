@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avatar.body.open import open_body
+from avatar.body.solving import posed_vertices
 from avatar.checks import DataError
 from avatar.data.layouts import find_outfit
 from avatar.data.scanner import ScanConfig
@@ -102,9 +104,6 @@ def test_people_who_lie(sample):
 
 
 def test_turned_parameters_pose_the_turned_body(sample):
-    from avatar.body.open import open_body
-    from avatar.body.solving import posed_vertices
-
     body, placement = open_body("female"), find_placement(PATH, sample[0][:1], "cm", "z")
     rng = np.random.default_rng(0)
     pose, translation = 0.3 * rng.standard_normal((22, 3)), 100 * rng.standard_normal(3)
