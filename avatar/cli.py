@@ -210,15 +210,18 @@ def doctor() -> None:
 
 
 def convert_body() -> None:
-    """Converts a downloaded SMPL, SMPL-H or SMPL-X file (.npz or .pkl) to a plain .npz, running nothing that is in it.
+    """Converts a downloaded SMPL, SMPL-H or SMPL-X file (.npz or .pkl), or a rigged GLB, to a plain .npz.
+
+    Nothing that is in the file is run.
 
     convert_body SMPLX_NEUTRAL.npz data/bodies/smplx_neutral.npz
     convert_body SMPL_NEUTRAL.pkl data/bodies/smpl_neutral.npz --uv smpl_uv.obj
+    convert_body person.glb data/bodies/person.npz
     convert_body data/theirs/coat/template.npz with_uv.npz --uv body.obj
     """
     paths = parse(
         convert_body,
-        source={"type": path, "help": "the downloaded model, .npz or .pkl"},
+        source={"type": path, "help": "the downloaded model, .npz, .pkl or a rigged .glb or .gltf"},
         target=TARGET,
         uv={"type": path, "default": None, "help": "an OBJ of the same mesh whose texture coordinates POP is to use"},
     )

@@ -14,10 +14,13 @@ from torch import Tensor
 from avatar.body.model import BodyModel
 from avatar.body.open import Phenotype, anny_body, open_body
 from avatar.body.packed import holds_template, packed_body
+from avatar.body.rigged import rigged_body
 from avatar.body.smpl import DOWNLOAD_PAGES, converted_kind, smpl_body, way_to_file
 from avatar.checks import AvatarError, unknown_name
+from avatar.io.rigs import RIG_SUFFIXES
 from avatar.settings import settings_from_dict
 
+OWN_FILES = {"packed": "the template.npz of a dataset's outfit", "rigged": "a rigged GLB or glTF file"}
 CANONICAL_POSES = {"t": 0.0, "apart": 25.0}  # degrees by which each hip is turned outwards
 
 
@@ -25,10 +28,10 @@ CANONICAL_POSES = {"t": 0.0, "apart": 25.0}  # degrees by which each hip is turn
 class BodyConfig:
     """Which body, in which shape, with which canonical pose."""
 
-    name: str = "open"  # open, anny, smpl, smplh, smplx or packed
+    name: str = "open"  # open, anny, smpl, smplh, smplx, packed or rigged
     shape: str = "female"  # open: one of the asset's shapes, or mean
     phenotype: Phenotype = field(default_factory=Phenotype)  # anny: shape parameters, each in [0, 1]
-    path: str = ""  # smpl, smplh, smplx: file from tools/convert_body.py; packed: template.npz or tools/make_body.py's
+    path: str = ""  # file of tools/convert_body.py; packed: template.npz or tools/make_body.py's; rigged: GLB or glTF
     betas: list[float] = field(default_factory=list)  # smpl, smplh, smplx: shape, standard deviations
     all_joints: bool = True  # smpl, smplh, smplx: all joints of the file; false: hands and face at rest, 22 joints
     canonical: str = "t"  # t, or apart (hips 25 degrees outwards, for skirts)
@@ -40,27 +43,31 @@ class BodyConfig:
             raise unknown_name("body.canonical", self.canonical, CANONICAL_POSES)
         if self.betas and self.name not in DOWNLOAD_PAGES:
             raise AvatarError(f"body.betas: expected none, as a body of kind {self.name} has no such shape.")
-        if self.name == "packed" and not self.path:
-            raise AvatarError("body.path: expected the template.npz of a dataset's outfit, got none.")
+        if self.name in OWN_FILES and not self.path:
+            raise AvatarError(f"body.path: expected {OWN_FILES[self.name]}, got none.")
         if self.name in DOWNLOAD_PAGES and not self.path:
             raise AvatarError(f"body.path: expected a {self.name} file, got none. {way_to_file(self.name)}")
 
 
 def load_body(config: BodyConfig) -> BodyModel:
-    """The body a configuration names, float32; errors as in `open_body`, `anny_body`, `smpl_body`, `packed_body`."""
+    """The body a configuration names, float32; errors as in the function of its kind."""
     body = BODIES[config.name](config)
     return body.with_canonical_pose(canonical_pose(config.canonical, body.joint_names))
 
 
 def body_of_file(path: Path, settings: dict[str, Any], name: str = "") -> BodyModel:
-    """The body in a file: a converted SMPL, SMPL-H or SMPL-X model, or a ``template.npz`` (see `packed_body`).
+    """The body in a file: a converted SMPL, SMPL-H or SMPL-X model, a ``template.npz`` (see `packed_body`), or a rigged
+    GLB or glTF file (see `rigged_body`).
 
     Settings are options of `BodyConfig` but ``name`` and ``path``; ``model``, if any, is what the file must hold, and
     ``name`` where they stand, for messages. Raises `AvatarError` for an unknown option; `DataError` for a missing or
     damaged file or one of another kind, with the command that makes a good one.
     """
     given = dict(settings)
-    model = given.pop("model", None) or ("packed" if holds_template(path) else converted_kind(path))
+    model = given.pop("model", None)
+    if model is None and Path(path).suffix.lower() in RIG_SUFFIXES:
+        model = "rigged"
+    model = model or ("packed" if holds_template(path) else converted_kind(path))
     return load_body(settings_from_dict(BodyConfig, {**given, "name": model, "path": str(path)}, name))
 
 
@@ -94,4 +101,5 @@ BODIES = {
     "anny": lambda config: anny_body(config.phenotype),
     **dict.fromkeys(DOWNLOAD_PAGES, _smpl),
     "packed": lambda config: packed_body(Path(config.path)),
+    "rigged": lambda config: rigged_body(Path(config.path)),
 }

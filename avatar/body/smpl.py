@@ -13,10 +13,20 @@ from torch import Tensor
 
 from avatar.body.inert_pickle import read_pickled_arrays
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
-from avatar.body.packed import add_atlas, atlas_arrays, data_errors, float32_tensor, holds_template, template_of
+from avatar.body.packed import (
+    add_atlas,
+    atlas_arrays,
+    data_errors,
+    float32_tensor,
+    holds_template,
+    template_of,
+    write_body,
+)
+from avatar.body.rigged import rigged_body
 from avatar.checks import AvatarError, DataError, check_finite, check_shape
 from avatar.geometry.uv import check_atlas
 from avatar.io.npz import read_arrays, write_arrays
+from avatar.io.rigs import RIG_SUFFIXES
 
 WRISTS = {"left": SMPL_JOINTS.index("left_wrist"), "right": SMPL_JOINTS.index("right_wrist")}
 HEAD = SMPL_JOINTS.index("head")
@@ -176,19 +186,26 @@ OPTIONAL_SOURCE_KEYS |= SOURCE_HANDS
 
 
 def convert_body_model(source: Path, target: Path, uv: Path | None = None) -> str:
-    """Converts a downloaded SMPL, SMPL-H or SMPL-X file, ``.npz`` or ``.pkl``, to the npz that `smpl_body` reads.
+    """Converts a downloaded SMPL, SMPL-H or SMPL-X file, ``.npz`` or ``.pkl``, to the npz that `smpl_body` reads, and a
+    rigged GLB or glTF file to a ``template.npz`` (`rigged_body`).
 
     Code and object arrays in it are never touched. A UV atlas, which POP and SCALE need, comes from the OBJ file ``uv``
     of the same mesh, or from the file where it has one (SMPL-X does). With such an OBJ a ``template.npz`` of our own
-    may be the source as well: any body then gets an atlas. Gives the kind of model: smpl, smplh, smplx or packed (a
-    ``template.npz``). Raises `DataError` naming the file, for a damaged or hostile one, missing keys, or shapes that do
-    not fit; `AvatarError` when the target is not an npz.
+    may be the source as well: any body then gets an atlas. Gives the kind of model: smpl, smplh, smplx, rigged or
+    packed (a ``template.npz``). Raises `DataError` naming the file, for a damaged or hostile one, missing keys, or
+    shapes that do not fit; `AvatarError` when the target is not an npz.
     """
     source, target = Path(source), Path(target)
     if target.suffix != ".npz":
         raise AvatarError(f"target: expected a .npz file to write, got {target}.")
-    if source.suffix not in (".npz", ".pkl"):
-        raise DataError(source, f"expected a .npz or .pkl body model, got {source.suffix or 'no suffix'}.")
+    if source.suffix not in (".npz", ".pkl", *RIG_SUFFIXES):
+        got = source.suffix or "no suffix"
+        raise DataError(source, f"expected a .npz or .pkl body model or a rigged .glb, got {got}.")
+    if source.suffix in RIG_SUFFIXES:
+        if uv is not None:
+            raise AvatarError(f"uv: expected none for {source}, a rigged file has its own.")
+        write_body(target, rigged_body(source))
+        return "rigged"
     if uv is not None and source.suffix == ".npz" and holds_template(source):
         add_atlas(source, target, uv)
         return "packed"

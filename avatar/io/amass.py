@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from avatar.body.model import SMPL_JOINTS
-from avatar.checks import AvatarError, DataError
-from avatar.io.npz import read_arrays
+from avatar.checks import AvatarError, DataError, check_finite
+from avatar.io.documents import read_json_record
+from avatar.io.npz import naming, read_arrays
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +23,8 @@ WHOLE = ("poses", "fullpose", "pose")  # all joints, the root first
 PARTS = (("root_orient", "pose_body"), ("global_orient", "body_pose"), ("Rh", "poses"))  # root, others
 TRANSLATIONS = ("trans", "transl", "Th")
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate")
-KEYS = list(dict.fromkeys((*WHOLE, *sum(PARTS, ()), *TRANSLATIONS)))
+SHAPES = ("betas", "shapes", "shape", "beta")
+KEYS = tuple(dict.fromkeys((*WHOLE, *sum(PARTS, ()), *TRANSLATIONS)))
 WIDTHS = (66, 72, 75, 78, 90, 99, 156, 159, 165)  # SMPL's 22 and 24 joints; with PCA hands; SMPL-H's; SMPL-X's
 
 
@@ -31,18 +34,17 @@ class SmplArrays:
 
     poses: np.ndarray
     translations: np.ndarray
-    fps: float
     usual_up: str | None  # the axis that is up by convention; None for keys without one
 
 
-def read_smpl_arrays(path: Path, fps: float | None, pelvis: np.ndarray) -> SmplArrays:
-    """Reads body poses under any of the known keys; hands, face and shape are left out.
+def read_smpl_arrays(path: Path, pelvis: np.ndarray) -> SmplArrays:
+    """Reads body poses under any of the known keys, of an npz or a JSON file; hands and face are left out.
 
-    Axis-angles are ``(T, 3 J)`` or ``(T, J, 3)`` of at least 22 joints, flat for one frame, numbers of any kind. A file
-    without a rate is taken at ``fps``. ``pelvis (3,)`` is the T-pose's, about which EasyMocap does not turn. Raises
-    `DataError` naming file and key for what is missing, of other shapes, in degrees or pickled.
+    Axis-angles are ``(T, 3 J)`` or ``(T, J, 3)`` of at least 22 joints, flat for one frame, numbers of any kind.
+    ``pelvis (3,)`` is the T-pose's, about which EasyMocap does not turn. Raises `DataError` naming file and key for
+    what is missing, of other shapes, in degrees or pickled, and for a JSON file of several people.
     """
-    found = read_arrays(path, {}, {key: f"number {_private(key)}" for key in KEYS})
+    found = _read_keys(path, KEYS)
     moves = next((key for key in TRANSLATIONS if key in found), None)
     if moves is None:
         keys = ", ".join(sorted(found)) or "none of poses"
@@ -68,7 +70,29 @@ def read_smpl_arrays(path: Path, fps: float | None, pelvis: np.ndarray) -> SmplA
     if largest > 4 * np.pi:
         raise DataError(path, f"poses: expected radians, got turns of {largest:.0f}.", "Convert degrees first.")
     usual = "z" if moves == "trans" else None
-    return SmplArrays(poses, translations.astype(np.float32), _rate(path, fps), usual)
+    return SmplArrays(poses, translations.astype(np.float32), usual)
+
+
+def read_betas(path: Path) -> np.ndarray | None:
+    """The shape coefficients ``(T, B)`` or ``(1, B)`` in a file of `read_smpl_arrays`; None where it has none."""
+    found = _read_keys(path, SHAPES)
+    return next((_frames(path, key, array) for key, array in found.items()), None)
+
+
+def _read_keys(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
+    """Arrays of numbers under the keys that are there."""
+    if path.suffix.lower() != ".json":
+        return read_arrays(path, {}, {key: f"number {_private(key)}" for key in keys})
+    record, found = read_json_record(path), {}
+    for key in keys:
+        if key in record:
+            try:
+                found[key] = np.array(record[key], np.float64)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise DataError(path, f"{key}: expected numbers in lists, got others ({error!s:.100}).") from error
+            with naming(path):
+                check_finite(key, found[key])
+    return found
 
 
 def _private(key: str) -> str:
@@ -126,8 +150,8 @@ def _easymocap(
     return np.concatenate([turns.as_rotvec(), others], axis=1), translations + shift
 
 
-def _rate(path: Path, fps: float | None) -> float:
-    """Frames a second: the file's own, as a number or text of one, else ``fps``."""
+def read_rate(path: Path, fps: float | None) -> float:
+    """Frames a second of an npz: the file's own, as a number or text of one, else ``fps``; `DataError` without any."""
     trouble = ""
     for key in RATES:
         try:

@@ -35,6 +35,23 @@ def read_json(path: Path) -> dict[str, Any]:
     return _read_mapping(path, JSON_BYTES, "JSON", json.loads)
 
 
+def read_json_record(path: Path) -> dict[str, Any]:
+    """The one object of a JSON file: as `read_json`, or alone in an array, or in an array under ``annots``.
+
+    EasyMocap writes an array of the people in a frame. Raises `DataError` for several.
+    """
+
+    def parse(text: str) -> Any:
+        values = json.loads(text)
+        if isinstance(values, dict) and isinstance(values.get("annots"), list):
+            values = values["annots"]
+        if isinstance(values, list) and len(values) != 1:
+            raise DataError(path, f"expected one person, got {len(values)}.", "Hint: write one file a person.")
+        return values[0] if isinstance(values, list) else values
+
+    return _read_mapping(path, JSON_BYTES, "JSON", parse)
+
+
 def check_events(path: Path, text: str) -> list[str]:
     """Refuses anchors and deep nesting in YAML text; gives its scalars, keys and values alike, unescaped."""
     depth, scalars = 0, []

@@ -8,6 +8,7 @@ import json
 import shlex
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -82,24 +83,35 @@ def read_gltf(path: Path, data: bytes) -> RawSurface:
     mesh that share their vertices share them still. Raises `DataError` naming the file and what is wrong: compressed or
     quantised geometry with the command that undoes it, URIs out of the file's folder, accessors beyond their buffers.
     """
+    with reading_gltf(path):
+        return _read(open_scene(path, data))
+
+
+@contextmanager
+def reading_gltf(path: Path) -> Iterator[None]:
+    """Errors that come of invalid JSON within the block become `DataError`."""
     try:
-        return _read(path, data)
+        yield
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(path, f"cannot be read as glTF 2.0 ({error!r:.200}).", "Hint: export it again.") from error
 
 
-def _read(path: Path, data: bytes) -> RawSurface:
+def open_scene(path: Path, data: bytes) -> Scene:
+    """The JSON and the binary chunk of a file; `DataError` for other versions, and extensions that cannot be read."""
     document, binary = _chunks(path, data)
     _check_version(path, document)
-    scene = Scene(path, document, {} if binary is None else {-1: binary}, limit=len(data))
+    return Scene(path, document, {} if binary is None else {-1: binary}, limit=len(data))
+
+
+def _read(scene: Scene) -> RawSurface:
     parts: list[Part] = []
     skinned = False
-    for node, transform, of in _nodes(scene):
+    for node, transform, of in scene_nodes(scene):
         skin = node.get("skin")
         skinned |= skin is not None
-        parts += _mesh_parts(scene, node["mesh"], transform, None if skin is None else _joints(scene, skin, of))
+        parts += _mesh_parts(scene, node["mesh"], transform, None if skin is None else skin_joints(scene, skin, of))
     if skinned:
         scene.note("A skinned mesh is read in the pose its joints are stored in; animations are not applied.")
     if any(part.faces for part in parts):
@@ -108,7 +120,9 @@ def _read(path: Path, data: bytes) -> RawSurface:
             scene.note(f"{lone} points beside its triangles are left out.")
         parts = [part for part in parts if part.faces]
     if not parts:
-        raise DataError(path, "expected triangles or points in its scene, got none.", "Hint: export the mesh itself.")
+        raise DataError(
+            scene.path, "expected triangles or points in its scene, got none.", "Hint: export the mesh itself."
+        )
     return _join(scene, parts)
 
 
@@ -157,7 +171,7 @@ def _compressed(path: Path, name: str) -> DataError:
     return DataError(path, problem, hint)
 
 
-def _nodes(scene: Scene) -> Iterator[tuple[dict[str, Any], np.ndarray, dict[int, np.ndarray]]]:
+def scene_nodes(scene: Scene) -> Iterator[tuple[dict[str, Any], np.ndarray, dict[int, np.ndarray]]]:
     """Nodes with a mesh, with world transforms ``(4, 4)`` of theirs and, by number, of all nodes."""
     nodes = scene.json.get("nodes", [])
     scenes = scene.json.get("scenes", [])
@@ -213,13 +227,13 @@ def _local(scene: Scene, node: dict[str, Any]) -> np.ndarray:
     return local
 
 
-def _joints(scene: Scene, skin: int, world: dict[int, np.ndarray]) -> np.ndarray:
+def skin_joints(scene: Scene, skin: int, world: dict[int, np.ndarray]) -> np.ndarray:
     """Transforms ``(J, 4, 4)`` of a skin's joints from the mesh's own frame to the scene's."""
     entry = scene.item("skins", skin)
     joints = np.stack([world[joint] for joint in entry["joints"]])
     if "inverseBindMatrices" not in entry:
         return joints
-    inverse = _accessor(scene, entry["inverseBindMatrices"], "MAT4").reshape(-1, 4, 4)
+    inverse = read_accessor(scene, entry["inverseBindMatrices"], "MAT4").reshape(-1, 4, 4)
     if len(inverse) < len(joints):
         raise DataError(scene.path, f"expected inverse bind matrices of {len(joints)} joints, got {len(inverse)}.")
     return joints @ np.swapaxes(inverse[: len(joints)], 1, 2)
@@ -249,7 +263,7 @@ def _mesh_parts(scene: Scene, mesh: int, transform: np.ndarray, joints: np.ndarr
             if not colored and "material" in primitive and _has_texture(scene, primitive["material"]):
                 scene.note("Textures are not read: no colours.")
         part = parts[key]
-        faces = _faces(scene, primitive, mode, len(part.vertices))
+        faces = primitive_faces(scene, primitive, mode, len(part.vertices))
         if faces is not None and joints is None and np.linalg.det(transform[:3, :3]) < 0:
             faces = faces[:, ::-1]  # a mirrored node turns the winding round (glTF 2.0, 3.7.4)
         if faces is not None:
@@ -259,12 +273,12 @@ def _mesh_parts(scene: Scene, mesh: int, transform: np.ndarray, joints: np.ndarr
 
 def _vertices(scene: Scene, attributes: dict[str, int], transform: np.ndarray, joints: np.ndarray | None) -> Part:
     """A set of vertices in the scene's frame."""
-    positions = _accessor(scene, attributes["POSITION"], "VEC3")
-    normals = _accessor(scene, attributes["NORMAL"], "VEC3") if "NORMAL" in attributes else None
+    positions = read_accessor(scene, attributes["POSITION"], "VEC3")
+    normals = read_accessor(scene, attributes["NORMAL"], "VEC3") if "NORMAL" in attributes else None
     colors = None
     if "COLOR_0" in attributes:
         entry = scene.item("accessors", attributes["COLOR_0"])
-        colors = _accessor(scene, attributes["COLOR_0"], "VEC3" if entry["type"] == "VEC3" else "VEC4")[:, :3]
+        colors = read_accessor(scene, attributes["COLOR_0"], "VEC3" if entry["type"] == "VEC3" else "VEC4")[:, :3]
         colors = np.clip(colors, 0, 1) if np.isfinite(colors).all() else None
     if any(of is not None and len(of) != len(positions) for of in (normals, colors)):
         raise DataError(scene.path, f"expected {len(positions)} normals and colours, got another number.")
@@ -283,23 +297,27 @@ def _vertices(scene: Scene, attributes: dict[str, int], transform: np.ndarray, j
 
 def _blend(scene: Scene, attributes: dict[str, int], joints: np.ndarray, count: int) -> np.ndarray:
     """Blended transforms ``(V, 4, 4)`` of a skinned mesh's vertices."""
-    blended, total = np.zeros((count, 16)), np.zeros(count)
-    for number in range(len(attributes)):
-        if f"JOINTS_{number}" not in attributes:
-            break
-        ids = _accessor(scene, attributes[f"JOINTS_{number}"], "VEC4", normalize=False).astype(np.int64)
-        weights = _accessor(scene, attributes[f"WEIGHTS_{number}"], "VEC4")
-        if len(ids) != count or len(weights) != count or (ids.size and ids.max() >= len(joints)):
-            raise DataError(scene.path, f"expected joints below {len(joints)} for {count} vertices, got others.")
-        for column in range(4):
-            blended += weights[:, column, None] * joints.reshape(-1, 16)[ids[:, column]]
-            total += weights[:, column]
-    if not count or not (total > 0).all():
+    ids, weights = read_influences(scene, attributes, len(joints), count)
+    return np.einsum("vk,vkc->vc", weights, joints.reshape(-1, 16)[ids]).reshape(-1, 4, 4)
+
+
+def read_influences(scene: Scene, attributes: dict[str, int], joints: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Joint indices and skinning weights ``(V, K)`` of a skinned mesh's ``count`` vertices, rows summing to 1."""
+    ids, weights = [np.empty((count, 0), np.int64)], [np.empty((count, 0))]
+    while f"JOINTS_{len(ids) - 1}" in attributes:
+        number = len(ids) - 1
+        ids.append(read_accessor(scene, attributes[f"JOINTS_{number}"], "VEC4", normalize=False).astype(np.int64))
+        weights.append(read_accessor(scene, attributes[f"WEIGHTS_{number}"], "VEC4"))
+        if len(ids[-1]) != count or len(weights[-1]) != count or (ids[-1].size and ids[-1].max() >= joints):
+            raise DataError(scene.path, f"expected joints below {joints} for {count} vertices, got others.")
+    chosen, values = np.concatenate(ids, axis=1), np.concatenate(weights, axis=1)
+    totals = values.sum(axis=1, keepdims=True)
+    if not count or not (totals > 0).all():
         raise DataError(scene.path, "expected skinning weights for all vertices, got none for some.")
-    return (blended / total[:, None]).reshape(-1, 4, 4)
+    return chosen, values / totals
 
 
-def _faces(scene: Scene, primitive: dict[str, Any], mode: int, count: int) -> np.ndarray | None:
+def primitive_faces(scene: Scene, primitive: dict[str, Any], mode: int, count: int) -> np.ndarray | None:
     """Triangles ``(F, 3)`` of a primitive; None for points."""
     if mode == POINTS:
         return None
@@ -309,7 +327,7 @@ def _faces(scene: Scene, primitive: dict[str, Any], mode: int, count: int) -> np
             raise DataError(
                 scene.path, f"expected unsigned indices, got component type {entry['componentType']!r:.20}."
             )
-        corners = _accessor(scene, primitive["indices"], "SCALAR", normalize=False)[:, 0].astype(np.int64)
+        corners = read_accessor(scene, primitive["indices"], "SCALAR", normalize=False)[:, 0].astype(np.int64)
     else:
         scene.count(count)
         corners = np.arange(count)
@@ -329,7 +347,7 @@ def _has_texture(scene: Scene, material: Any) -> bool:
     return "baseColorTexture" in scene.item("materials", material).get("pbrMetallicRoughness", {})
 
 
-def _accessor(scene: Scene, index: Any, kind: str, normalize: bool = True) -> np.ndarray:
+def read_accessor(scene: Scene, index: Any, kind: str, normalize: bool = True) -> np.ndarray:
     """Values ``(N, width)`` of an accessor, sparse ones put in: float64, or the stored type unless ``normalize``."""
     entry = scene.item("accessors", index)
     count = entry["count"]

@@ -14,7 +14,7 @@ from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS, BodyModel
 from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.checks import AvatarError, DataError, check_suffix, plain_name
 from avatar.geometry.units import METRES
-from avatar.io.amass import read_smpl_arrays
+from avatar.io.amass import read_rate, read_smpl_arrays
 from avatar.io.bvh import BvhMotion, read_bvh
 from avatar.io.joint_names import INDEX, MAP_HINT, map_joints, read_joint_map
 from avatar.io.npz import naming, read_arrays, write_described
@@ -211,8 +211,9 @@ def _read_npz(path: Path, up: str | None, rest: np.ndarray, fps: float | None, u
         stored, usual = read_arrays(path, MOTION, version=MOTION_FORMAT), "y"
         motion = Motion(stored["poses"], stored["translations"], float(stored["fps"]), str(stored["name"]))
     else:
-        arrays = read_smpl_arrays(path, fps, rest[0])
-        motion, usual = Motion(arrays.poses, arrays.translations, arrays.fps, path.stem), arrays.usual_up
+        arrays = read_smpl_arrays(path, rest[0])
+        motion = Motion(arrays.poses, arrays.translations, read_rate(path, fps), path.stem)
+        usual = arrays.usual_up
     _check_own_rate(path, motion.fps)
     if len(motion.poses) == 0:
         return motion

@@ -6,7 +6,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import ClassVar
 
@@ -18,7 +18,7 @@ from avatar.geometry.units import METRES
 from avatar.invocation import command_line, option
 from avatar.io.ledger import file_digest
 from avatar.io.raw_surface import RawSurface
-from avatar.records import Template
+from avatar.records import Mesh, Template
 
 UPS = ("y", "z", "-y", "-z", "x", "-x")
 
@@ -140,6 +140,7 @@ class Source(ABC):
 
     def __init__(self, path: Path, name: str, config: SourceConfig):
         self.path, self.name, self.config = Path(path), name, config
+        self.digest = cache(file_digest)  # a file of several frames is read once
 
     @classmethod
     def missing(cls, path: Path, problem: str) -> DataError:
@@ -163,7 +164,19 @@ class Source(ABC):
 
     def made_of(self, frame: SourceFrame) -> list[str]:
         """Hashes of all that a frame is made from but the body."""
-        return [file_digest(file) for file in frame.files]
+        return [self.digest(file) for file in frame.files]
+
+    def body_mesh(self, frame: SourceFrame) -> Mesh | None:
+        """The mesh of any body that was fitted to a frame's scan, metres, y up: what another body is fitted to.
+
+        None where the frame has none.
+        """
+        return None
+
+    @property
+    def decisions(self) -> dict[str, str]:
+        """What was found for all of the outfit's frames where its files do not say it, such as units and axes."""
+        return {}
 
     @property
     def body(self) -> BodyModel | None:

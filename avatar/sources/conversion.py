@@ -17,6 +17,7 @@ import yaml
 from avatar.body.model import BodyModel
 from avatar.body.packed import write_body
 from avatar.body.registry import canonical_name
+from avatar.body.solving import posed_vertices
 from avatar.checks import AvatarError, DataError, check_name, check_range
 from avatar.data.folders import OUTFIT_FORMAT, SPLITS
 from avatar.data.packed_layout import BODY, BODY_FILES, MEAN, PackedOutfit
@@ -84,7 +85,7 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
         _claim(folder, source)
         ledger, failed = Ledger(folder), {}
         write_body_files(folder, source, ledger)
-        settings = {key: getattr(config, key) for key in ("units", "up", "points")}
+        settings = {"points": config.points, **source.decisions}
         bodies = {path.name: file_digest(path) for path in (*folder.glob("*.npz"), *folder.glob("*.obj"))}
         for frame in tracked(outfit.chosen, f"convert {source.name}"):
             path, label = folder / frame.split / f"{frame.name}.npz", f"{frame.split}/{frame.name}"
@@ -190,17 +191,15 @@ def packed_arrays(source: Source, frame: SourceFrame, points: int | None) -> dic
         problem = "expected a fitted body, nothing beside the scan says how it lies."
         raise DataError(frame.files[0], problem, source.body_hint)
     arrays = {key: getattr(posed, name) for key, name in FIT_KEYS.items()}
-    arrays |= scan_arrays(posed, posed_vertices(source, posed), points, frame.name)
+    arrays |= scan_arrays(posed, posed_body(source, posed), points, frame.name)
     arrays["scan_name"] = np.array(frame.name)
     return {key: value for key, value in arrays.items() if value is not None}
 
 
-def scan_arrays(
-    posed: PosedScan, body: np.ndarray | None, points: int | None, name: str
-) -> dict[str, np.ndarray | None]:
+def scan_arrays(posed: PosedScan, body: Mesh | None, points: int | None, name: str) -> dict[str, np.ndarray | None]:
     """A scan's arrays: as it is, or as ``points`` spread evenly over its mesh or taken from its points.
 
-    Normals that are missing are the mesh's, or estimated from the points and oriented by the posed ``body (V, 3)``.
+    Normals that are missing are the mesh's, or estimated from the points and oriented by the posed ``body``.
     What is drawn follows from the frame's name alone.
     """
     scan, labels = posed.scan, posed.labels
@@ -209,7 +208,7 @@ def scan_arrays(
         if scan.faces is not None:
             normals = vertex_normals(scan.vertices, scan.faces)
         else:
-            normals = oriented_normals(scan.vertices, body)
+            normals = oriented_normals(scan.vertices, body, name)
     arrays = {"scan_pc": scan.vertices, "scan_n": normals, "scan_labels": labels, "scan_colors": scan.colors}
     if points is None:
         arrays["scan_faces"] = scan.faces
@@ -232,16 +231,13 @@ def scan_arrays(
     return arrays
 
 
-def posed_vertices(source: Source, posed: PosedScan) -> np.ndarray | None:
-    """The posed body's vertices ``(V, 3)``: stored, or from its pose; None where they follow from transforms alone."""
-    if posed.vertices is not None or source.body is None or posed.pose is None:
-        return posed.vertices
-    pose = torch.zeros(1, len(source.body.parents), 3)
-    count = min(len(posed.pose), pose.shape[1])
-    pose[0, :count] = torch.from_numpy(np.asarray(posed.pose[:count], np.float32))
-    shift = torch.zeros(1, 3) if posed.translation is None else torch.from_numpy(posed.translation[None]).float()
-    with torch.no_grad():
-        return source.body(pose, shift).vertices[0].numpy()
+def posed_body(source: Source, posed: PosedScan) -> Mesh | None:
+    """The posed body: stored, or from its pose; None where it follows from transforms alone."""
+    body, vertices = source.body, posed.vertices
+    if vertices is None and body is not None and posed.pose is not None:
+        vertices = posed_vertices(body, posed.pose, posed.translation)
+    template = body if body is not None else source.mesh_template
+    return None if vertices is None or template is None else Mesh(vertices, template.faces.numpy())
 
 
 def write_body_files(folder: Path, source: Source, ledger: Ledger) -> None:
@@ -310,9 +306,10 @@ def _write_provenance(
         "source": str(source.path.resolve()),
         "layout": source.layout,
         "settings": settings_to_dict(config),
+        "decisions": source.decisions,
         "body": [str(path) for path in source.body_files],
         "frames": {
-            f"{frame.split}/{frame.name}": {str(file): file_digest(file) for file in frame.files} for frame in frames
+            f"{frame.split}/{frame.name}": {str(file): source.digest(file) for file in frame.files} for frame in frames
         },
         "left_out": failed,
     }

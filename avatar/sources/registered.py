@@ -20,14 +20,14 @@ from avatar.fitting.subjects import SubjectFit, fit_subject
 from avatar.io.ledger import Ledger, digest_of
 from avatar.io.locks import lock_folder
 from avatar.progress import tracked
-from avatar.records import Mesh, PointCloud
+from avatar.records import PointCloud
 from avatar.sources.base import PosedScan, Source, SourceFrame
 from avatar.sources.conversion import (
     ConvertConfig,
     chosen_frames,
     convert_outfit,
     converted_folder,
-    posed_vertices,
+    posed_body,
     scan_arrays,
 )
 
@@ -121,8 +121,8 @@ def write_report(folder: Path, source: RegisteredSource, frames: Sequence[Source
     for number in tracked(spaced_frames(range(len(fits)), count), "pictures", unit="picture"):
         fitted = fits[number]
         posed = PosedScan(clouds.source.read(frames[number]).scan, pose=fitted.pose, translation=fitted.translation)
-        mesh = Mesh(posed_vertices(source, posed), source.body.template.faces.numpy())
-        save_picture(folder / f"{fitted.name}.png", picture_fit(clouds[number], mesh, fitted.heading))
+        picture = picture_fit(clouds[number], posed_body(source, posed), fitted.heading)
+        save_picture(folder / f"{fitted.name}.png", picture)
 
 
 def fit_outfit_body(source: Source, config: FitScansConfig) -> tuple[Path, tuple[str, ...]]:

@@ -10,11 +10,12 @@ from avatar.sources.cape_raw import CapeRawSource
 from avatar.sources.dress4d import Dress4dSource
 from avatar.sources.fite import FiteSource
 from avatar.sources.packed import PackedSource
+from avatar.sources.plain import PlainScans
 from avatar.sources.published import named_outfits
 from avatar.sources.scanimate import ScanimateSource
 from avatar.sources.thuman import ThumanSource
 
-KINDS = (PackedSource, FiteSource, CapeRawSource, Dress4dSource, ScanimateSource, ThumanSource)
+KINDS = (PackedSource, FiteSource, CapeRawSource, Dress4dSource, ScanimateSource, ThumanSource, PlainScans)
 LAYOUTS: dict[str, type[Source]] = {kind.layout: kind for kind in KINDS}  # as they are looked for; plain folders last
 
 

@@ -54,7 +54,7 @@ def test_canonical_pose_by_name_for_any_joints():
 
 
 def test_unknown_names_list_the_known():
-    with pytest.raises(AvatarError, match="expected one of open, anny, smpl, smplh, smplx, packed, got 'smlp'"):
+    with pytest.raises(AvatarError, match="expected one of open, anny, smpl, smplh, smplx, packed, rigged, got 'smlp'"):
         BodyConfig(name="smlp")
     with pytest.raises(AvatarError, match="expected one of t, apart, got 'a'"):
         BodyConfig(canonical="a")
