@@ -15,7 +15,7 @@ from avatar.data.outfits import Outfit
 from avatar.environment import prepared_process
 from avatar.io.npz import write_whole
 from avatar.sources.base import Source, SourceConfig
-from avatar.sources.conversion import ConvertConfig, SourceOutfit, convert_outfit
+from avatar.sources.conversion import ConvertConfig, SourceOutfit, UnfittedError, convert_outfit
 from avatar.sources.findings import Findings, FrameFinding, describe, measure_outfit
 from avatar.sources.registered import FitScansConfig, fit_outfit_body
 from avatar.sources.registry import open_sources
@@ -123,17 +123,27 @@ def _facts(outfit: Outfit) -> list[str]:
     if source:
         sequences = {frame.sequence for frame in source.frames} - {""}
         given = "as the layout has them" if any(frame.split for frame in source.frames) else "by test=, the last frames"
+        lines += [f"{what}: {found}" for what, found in source.decisions.items()]
         lines.append(f"sequences: {len(sequences) or 'single scans'}; splits {given}")
     lines.append("frames: " + ", ".join(f"{len(names)} {split}" for split, names in sizes.items()))
     split, names = next(iter(sizes.items()))
-    frame, body = outfit.load(split, names[0]), outfit.body
-    scan = frame.scan
-    kind = f"{len(scan.points):,} points" if scan.faces is None else f"mesh of {len(scan.faces):,} faces"
-    lines.append(f"first scan, {names[0]}: {kind}{', coloured' if scan.colors is not None else ''}")
-    vertices = len(outfit.template.vertices)
-    height = float(outfit.template.vertices[:, 1].max() - outfit.template.vertices[:, 1].min())
-    posable = f"{len(body.parents)} joints" if body else "a mesh alone, which motions cannot pose"
-    return [*lines, f"body: {vertices:,} vertices, {height:.2f} m tall, {posable}"]
+    try:
+        scan = outfit.load(split, names[0]).scan
+        points, body = len(scan.points), _body_facts(outfit)
+    except UnfittedError:
+        scan = outfit.read(split, names[0]).scan
+        points, body = len(scan.vertices), f"none beside the scans. {outfit.source.body_hint}"
+    kind = f"{points:,} points" if scan.faces is None else f"mesh of {len(scan.faces):,} faces"
+    colors = "" if scan.colors is None else ", coloured"
+    return [*lines, f"first scan, {names[0]}: {kind}{colors}", f"body: {body}"]
+
+
+def _body_facts(outfit: Outfit) -> str:
+    """An outfit's body in words."""
+    vertices = outfit.template.vertices
+    height = float(vertices[:, 1].max() - vertices[:, 1].min())
+    joints = f"{len(outfit.body.parents)} joints" if outfit.body else "a mesh alone, which motions cannot pose"
+    return f"{len(vertices):,} vertices, {height:.2f} m tall, {joints}"
 
 
 def write_findings(path: Path, found: dict[str, Findings]) -> None:

@@ -45,6 +45,10 @@ FAST = 1  # level of deflating: a few percent larger than level 9, in a tenth of
 log = logging.getLogger(__name__)
 
 
+class UnfittedError(DataError):
+    """A scan without a fitted body."""
+
+
 @dataclass
 class ConvertConfig(SourceConfig):
     """Conversion of a data set's outfits, or of one folder of scans, to outfits of this project."""
@@ -81,6 +85,8 @@ def convert_outfit(source: Source, config: ConvertConfig) -> Path:
     """
     folder = converted_folder(source, config)
     outfit = SourceOutfit(source, config)
+    if source.body is None and source.mesh_template is None:
+        raise DataError(source.path, "expected a body beside the scans or body.path, there is none.", source.body_hint)
     with lock_folder(folder.parent / ".locks" / folder.name):
         _claim(folder, source)
         ledger, failed = Ledger(folder), {}
@@ -154,6 +160,10 @@ class SourceOutfit(PackedOutfit):
         super().frame_path(split, name)
         return self._by_name[split, name].files[0]
 
+    def read(self, split: str, name: str) -> PosedScan:
+        """A frame as its files hold it, fitted or not."""
+        return self.source.read(self._by_name[split, name])
+
     def _read_template(self) -> Template:
         if self.source.body is None and self.source.mesh_template is not None:
             return self.source.mesh_template
@@ -185,11 +195,11 @@ def chosen_frames(source: Source, config: ConvertConfig) -> list[SourceFrame]:
 
 
 def packed_arrays(source: Source, frame: SourceFrame, points: int | None) -> dict[str, np.ndarray]:
-    """A frame as the arrays of a packed npz (docs/data.md). Raises `DataError` for a scan without a fitted body."""
+    """A frame as the arrays of a packed npz (docs/data.md). Raises `UnfittedError` for a scan without a fitted body."""
     posed = source.read(frame)
     if not posed.fitted:
         problem = "expected a fitted body, nothing beside the scan says how it lies."
-        raise DataError(frame.files[0], problem, source.body_hint)
+        raise UnfittedError(frame.files[0], problem, source.body_hint)
     arrays = {key: getattr(posed, name) for key, name in FIT_KEYS.items()}
     arrays |= scan_arrays(posed, posed_body(source, posed), points, frame.name)
     arrays["scan_name"] = np.array(frame.name)

@@ -13,10 +13,13 @@ from avatar.data.folders import SPLITS
 from avatar.data.outfits import Outfit
 from avatar.data.splits import spaced_frames
 from avatar.data.validation import measure_overlap
+from avatar.geometry.orientation import measure_winding
 from avatar.geometry.trees import build_tree
 from avatar.io.ledger import file_digest
+from avatar.io.raw_surface import RawSurface
 from avatar.progress import tracked
 from avatar.records import Frame, Template
+from avatar.sources.conversion import UnfittedError
 
 REACH = 0.10  # metres from the skin within which cloth is expected but for skirts and hoods
 STRAY = 0.5  # metres from the skin beyond which a point is no part of the person
@@ -29,7 +32,8 @@ class FrameFinding:
     """One frame measured, or why it is refused.
 
     Shares are of 1: ``covered`` of the skin with a scan point near, ``buried`` of the scan deep inside, ``outward`` of
-    its normals, ``stray`` of its points far from the body; ``uncovered`` names joints whose skin has no scan near.
+    its normals, ``stray`` of its points far from the body; ``uncovered`` names joints whose skin has no scan near. A
+    scan that is not ``fitted`` has none of these; ``against`` is the share of its faces wound against the others.
     """
 
     split: str
@@ -43,6 +47,8 @@ class FrameFinding:
     stray: float = 0.0
     height: float = 0.0
     uncovered: tuple[str, ...] = ()
+    fitted: bool = True
+    against: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,9 @@ def measure_outfit(outfit: Outfit, most: int | None = None) -> Findings:
         digests[file_digest(outfit.frame_path(split, name))].append(f"{split}/{name}")
         try:
             frame = outfit.load(split, name)
+        except UnfittedError:
+            found.append(measure_scan(split, name, outfit.read(split, name).scan))
+            continue
         except AvatarError as error:
             found.append(FrameFinding(split, name, str(error)))
             continue
@@ -97,6 +106,16 @@ def measure_frame(frame: Frame, template: Template) -> FrameFinding:
         stray=float((build_tree(body).query(scan.points)[0] > STRAY).mean()),
         height=float(np.ptp(scan.points[:, 1])),
         uncovered=uncovered_joints(scan.points, body, template),
+    )
+
+
+def measure_scan(split: str, name: str, scan: RawSurface) -> FrameFinding:
+    """Measures a scan without a body, metres, y up."""
+    faces = 0 if scan.faces is None else len(scan.faces)
+    against = measure_winding(scan.vertices, scan.faces).against if faces else 0.0
+    height = float(scan.extents[1])
+    return FrameFinding(
+        split, name, points=len(scan.vertices), faces=faces, height=height, fitted=False, against=against
     )
 
 
@@ -126,23 +145,32 @@ def describe(findings: Findings) -> list[str]:
     """Findings in lines: what is there, what is doubtful with the figure, what is refused."""
     valid = [frame for frame in findings.frames if not frame.problem]
     lines = [f"frames: {', '.join(f'{count} {split}' for split, count in findings.sizes.items())}"]
+    fitted = [frame for frame in valid if frame.fitted]
     if valid:
         lines += [
             f"points a scan: {_range(frame.points for frame in valid)}"
             + (f", faces {_range(frame.faces for frame in valid)}" if any(f.faces for f in valid) else ""),
             f"scan's height, m: {_range((frame.height for frame in valid), '.2f')}",
-            f"skin with a scan point near: {_range((frame.covered for frame in valid), '.0%')}",
-            f"scan deep inside the body: {_range((frame.buried for frame in valid), '.1%')}",
-            f"normals that point outward: {_range((frame.outward for frame in valid), '.0%')}",
         ]
-        worst = max(valid, key=lambda frame: frame.stray)
+    if len(fitted) < len(valid):
+        lines.append(f"without a fitted body: {len(valid) - len(fitted)} of {len(valid)} frames")
+        worst = max(valid, key=lambda frame: frame.against)
+        if worst.against:
+            lines.append(f"faces wound against the others: up to {worst.against:.1%}, in {worst.split}/{worst.name}")
+    if fitted:
+        lines += [
+            f"skin with a scan point near: {_range((frame.covered for frame in fitted), '.0%')}",
+            f"scan deep inside the body: {_range((frame.buried for frame in fitted), '.1%')}",
+            f"normals that point outward: {_range((frame.outward for frame in fitted), '.0%')}",
+        ]
+        worst = max(fitted, key=lambda frame: frame.stray)
         if worst.stray:
             lines.append(
                 f"points farther than {STRAY} m from the body: {worst.stray:.1%} in {worst.split}/{worst.name}"
             )
-        bare = Counter(joint for frame in valid for joint in frame.uncovered)
+        bare = Counter(joint for frame in fitted for joint in frame.uncovered)
         for joint, count in bare.most_common():
-            lines.append(f"without a scan: {joint} in {count} of {len(valid)} frames")
+            lines.append(f"without a scan: {joint} in {count} of {len(fitted)} frames")
     lines += [f"the same file: {', '.join(same)}" for same in findings.copies]
     for one, other, apart in findings.leaked:
         lines.append(f"one pose in two splits: {one} and {other}, {apart:.3f} rad apart")
