@@ -21,12 +21,15 @@ import numpy as np
 import torch
 from bodies import distinct, random_bind, random_model, write_unwrapped
 
-from avatar.body.packed import write_template
-from avatar.data.layouts import open_outfit_folder
+from avatar.body.packed import write_body, write_template
+from avatar.data.layouts import OpenOutfit, open_outfit_folder
 from avatar.data.packed_layout import write_packed_outfit
 from avatar.io.frames import write_manifest
 from avatar.io.motions import write_motion
+from avatar.io.points import write_points
+from avatar.records import PointCloud
 from avatar.simulate.angles import authored_motion
+from avatar.verbs import GROUPS
 
 ROOT = Path(__file__).parents[1]
 PROGRAMS = "python|python3|torchrun|srun|sbatch|make|pip|apt-get|conda|docker|bash|sh"
@@ -102,6 +105,8 @@ SHORT = {
     ),
     "bench": ("quick=true", "repeats=1", "memory=false"),
     "check_reliability": ("only=[fuzz]", "files=50"),
+    "data_check": ("frames=2",),
+    "data_fit": ("body.path=scans/coat/template.npz", "fitting.headings=1", "pictures=1"),
 }
 
 # And fewer jobs of an experiment, or of one with certain options: test_configs.py composes them all.
@@ -147,6 +152,10 @@ PROMISED = {
     "make_motion": ["{1}"],
     "pack": ["{1}/train/*.npz"],
     "doctor": [],
+    "data_info": [],
+    "data_check": [],
+    "data_convert": ["data/{dataset}/{own}/train/*.npz", "data/{dataset}/{own}/manifest.json"],
+    "data_fit": ["data/{dataset}/{own}/train/*.npz", "data/{dataset}/{own}/fits/fits.csv"],
 }
 USUAL = {
     "dataset": "sample",
@@ -241,8 +250,10 @@ def filled(text: str) -> list[str]:
 
 def verb_of(text: str) -> str:
     """The verb of a command: ``train`` of ``python tools/train.py ...``, the line itself where there is none."""
-    named = re.search(r"tools/(\w+)\.py", text)
-    return named.group(1) if named else text
+    named = re.search(r"tools/(\w+)\.py(?: (\w+)(?= |$))?", text)
+    if not named:
+        return text
+    return f"{named[1]}_{named[2]}" if named[1] in GROUPS and named[2] else named[1]
 
 
 def shortened(text: str) -> str:
@@ -276,6 +287,7 @@ def promised_files(text: str) -> list[str]:
         if "experiment" in given:
             given.setdefault("compare.table", given["experiment"])
         given |= {str(i): word for i, word in enumerate(words[2:])}
+        given["own"] = given["name"] if options.get("name") else Path(given.get("source", "scans")).name
         globs += [
             re.sub(r"{([\w.]+)}", lambda name, given=given: given[name.group(1)], g) for g in PROMISED[verb_of(text)]
         ]
@@ -352,6 +364,19 @@ def copy_program(folder: Path) -> Path:
     return folder
 
 
+def write_scans(outfit: OpenOutfit, folder: Path) -> None:
+    """Four scans of an outfit with a body and parameters beside them, ``coat``, and three in mm, ``unfitted``."""
+    write_body(folder / "coat/template.npz", outfit.body)
+    for number, name in enumerate(outfit.frames("train")[:4]):
+        frame = outfit.load("train", name)
+        points, normals = frame.scan.points[::10], frame.scan.normals[::10]
+        write_points(folder / f"coat/scan_{number}.ply", PointCloud(points, normals))
+        fit = {"poses": frame.body.pose.reshape(1, -1), "trans": frame.body.translation[None]}
+        np.savez(folder / f"coat/scan_{number}.npz", **fit)
+        if number < 3:
+            write_points(folder / f"unfitted/{number}.ply", PointCloud(1000 * points, normals))
+
+
 def prepare_workspace(folder: Path, program: Path) -> Path:
     """A folder with what a reader of the documents brings: data, a body, a motion, predictions of another program."""
     sample = program / "avatar/assets/sample"
@@ -364,6 +389,7 @@ def prepare_workspace(folder: Path, program: Path) -> Path:
     template = replace(random_bind(), faces=torch.from_numpy(model["f"].astype(np.int64)))
     write_template(folder / "data/theirs/coat/template.npz", template)
     write_packed_outfit(open_outfit_folder(folder / "data/open/dress"), folder / "data/mine/coat")
+    write_scans(open_outfit_folder(folder / "data/open/dress"), folder / "scans")
     for name in ("body.obj", "smpl_uv.obj"):
         write_unwrapped(folder / name, model, places)
     return folder

@@ -59,6 +59,12 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         "python tools/train.py outfit=dress method=layered",
         "python tools/predict.py run=runs/layered/sample/dress/default motion=walk.npz fps=15",
         "python tools/mesh.py run=runs/layered/sample/dress/default predictions=walk",
+        "python tools/data.py fit source=scans/unfitted dataset=mine name=jacket",
+        "python tools/canonicalize.py dataset=mine outfit=jacket",
+        "python tools/template.py dataset=mine outfit=jacket",
+        "python tools/train.py dataset=mine outfit=jacket method=layered train.minutes=15",
+        "python tools/predict.py run=runs/layered/mine/jacket/default motion=walk.npz",
+        "python tools/mesh.py run=runs/layered/mine/jacket/default predictions=walk",
     ),
     (
         "python tools/experiment.py experiment=closet5",
