@@ -93,7 +93,8 @@ class PlainScans(Source):
         given, beside = self.config.body, self._body_file
         if beside is None:
             return None
-        settings = {"canonical": given.canonical, "all_joints": given.all_joints is not False, "betas": list(given.betas)}
+        whole = given.all_joints is not False
+        settings = {"canonical": given.canonical, "all_joints": whole, "betas": list(given.betas)}
         if not given.betas and beside.suffix.lower() == ".npz" and not holds_template(beside):
             settings["betas"] = self._betas
         return body_of_file(beside, settings, "body.")
