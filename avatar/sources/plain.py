@@ -163,7 +163,7 @@ class PlainScans(Source):
 
     @cached_property
     def _arrays(self) -> dict[Path, str]:
-        """Kinds of the npz and JSON files: parameters, vertices, body; those that hold nothing of it are left out."""
+        """Kinds of the npz, JSON and pickled files: parameters, vertices, body; others are left out."""
         others = [path for folder in self._folders for path in folder.others]
         found = [path for path in dict.fromkeys([*others, *self._fit_files]) if path.suffix.lower() in ARRAYS]
         return {path: kind for path in found if (kind := array_kind(path))}
@@ -274,7 +274,7 @@ class PlainScans(Source):
         _check_count(fit, len(arrays.poses))
         pose, translation = arrays.poses[fit.place], arrays.translations[fit.place]
         if list(self.body.joint_names[: len(SMPL_JOINTS)]) != SMPL_JOINTS:
-            motion = Motion(pose[None], translation[None], 1.0, fit.path.stem)
+            motion = Motion(pose[None, : len(SMPL_JOINTS)], translation[None], 1.0, fit.path.stem)
             pose = move_body(motion, self.body).poses[0]
         return pose, translation
 
@@ -298,7 +298,8 @@ class PlainScans(Source):
             if len(self._kept) > 1:
                 self._kept.clear()
             parameters = self._arrays[path] == "parameters"
-            self._kept[path] = read_smpl_arrays(path, self._pelvis) if parameters else _read_vertices(path)
+            joints = len(self.body.parents)
+            self._kept[path] = read_smpl_arrays(path, self._pelvis, joints) if parameters else _read_vertices(path)
         return self._kept[path]
 
     @cached_property
