@@ -41,6 +41,7 @@ from avatar.sources.placement import FittedSample, Placement, StandingBody, find
 
 SAMPLES = 8  # frames from which units and axes are found
 SAMPLE_POINTS = 20_000  # of each scan
+SHOWN = 5  # names of files that are left out
 SHAPE_SAMPLES = 16  # files that shape coefficients are read from
 SHAPES_DIFFER = 0.05  # standard deviations
 FOREIGN = 0.01  # metres, root mean square, from a body mesh to the nearest pose of the body
@@ -79,9 +80,11 @@ class PlainScans(Source):
     @cached_property
     def frames(self) -> tuple[SourceFrame, ...]:
         """Frames sorted by split, sequence and number. Raises `DataError` for two scans of one name."""
-        if unknown := self._unknown:
-            kinds = ", ".join(sorted({path.suffix.lower() or path.name for path in unknown}))
-            log.warning("%s: %d files of unknown kinds are left out: %s.", self.path, len(unknown), kinds)
+        if unknown := [path.name for path in self._unknown]:
+            names = ", ".join(unknown[:SHOWN]) + ", ..." * (len(unknown) > SHOWN)
+            log.warning(
+                "%s: %d files that nothing is known of, or damaged, are left out: %s.", self.path, len(unknown), names
+            )
         return tuple(
             replace(frame, files=(*frame.files, *dict.fromkeys(fit.path for fit in self._fits[frame.name])))
             for frame in self._scans
