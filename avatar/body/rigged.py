@@ -22,6 +22,7 @@ from avatar.records import Template
 RIGID = 1e-3  # by which the entries of a joint's rotation may differ from one
 SIDEWAYS = 15.0  # degrees from sideways up to which a skeleton's arms are those of a T-pose
 ALONG = 0.9  # cosine to an axis of the file's from which on a person stands or faces along it
+TINY = 1e-12  # volume that a unit cube is scaled to
 NAMES_HINT = "Hint: rename its joints as Mixamo's, or as SMPL's (left_elbow), before it is exported."
 log = logging.getLogger(__name__)
 
@@ -59,6 +60,8 @@ def _body_of(path: Path, rig: Rig, joints: dict[str, int]) -> BodyModel:
     chosen = list(joints.values())
     places, motions = rig.places[chosen], rig.scene_from_bound[chosen]
     bound = motions[0]  # the pose in which weights were painted, as the root lies in the scene
+    if not abs(np.linalg.det(bound[:3, :3])) > TINY:
+        raise DataError(path, "expected a mesh with volume, got one that its skeleton flattens.")
     rest_from_bind = motions @ np.linalg.inv(bound)
     linear, rotations = rest_from_bind[:, :3, :3], _nearest_rotations(rest_from_bind[:, :3, :3])
     if not np.abs(linear - rotations).max() < RIGID:

@@ -1,4 +1,4 @@
-"""Array files of SMPL's motions under all their keys: AMASS, SMPL-X exports, smplx's arguments, EasyMocap's."""
+"""Body parameters of SMPL under all their keys: AMASS, SMPL-X exports, smplx's arguments, EasyMocap's."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from avatar.body.inert_pickle import read_pickled_arrays
 from avatar.body.model import SMPL_JOINTS
 from avatar.checks import AvatarError, DataError, check_finite
 from avatar.io.documents import read_json_record
@@ -30,19 +31,20 @@ WIDTHS = (66, 72, 75, 78, 90, 99, 156, 159, 165)  # SMPL's 22 and 24 joints; wit
 
 @dataclass(frozen=True)
 class SmplArrays:
-    """What a file holds, in its own axes and unit: ``poses (T, 22, 3)`` radians, ``translations (T, 3)``."""
+    """What a file holds, in its own axes and unit: ``poses (T, J, 3)`` radians, ``translations (T, 3)``."""
 
     poses: np.ndarray
     translations: np.ndarray
     usual_up: str | None  # the axis that is up by convention; None for keys without one
 
 
-def read_smpl_arrays(path: Path, pelvis: np.ndarray) -> SmplArrays:
-    """Reads body poses under any of the known keys, of an npz or a JSON file; hands and face are left out.
+def read_smpl_arrays(path: Path, pelvis: np.ndarray, joints: int = JOINTS) -> SmplArrays:
+    """Reads body poses under any of the known keys, of an npz, a JSON file or a pickled dictionary, which runs nothing.
 
-    Axis-angles are ``(T, 3 J)`` or ``(T, J, 3)`` of at least 22 joints, flat for one frame, numbers of any kind.
-    ``pelvis (3,)`` is the T-pose's, about which EasyMocap does not turn. Raises `DataError` naming file and key for
-    what is missing, of other shapes, in degrees or pickled, and for a JSON file of several people.
+    Axis-angles are ``(T, 3 J)`` or ``(T, J, 3)`` of at least 22 joints, flat for one frame, numbers of any kind. Hands
+    and face are left out, but for a file whose poses have just so many ``joints``. ``pelvis (3,)`` is the T-pose's,
+    about which EasyMocap does not turn. Raises `DataError` naming file and key for what is missing, of other shapes, in
+    degrees or pickled within an npz, and for a JSON file of several people.
     """
     found = _read_keys(path, KEYS)
     moves = next((key for key in TRANSLATIONS if key in found), None)
@@ -65,7 +67,8 @@ def read_smpl_arrays(path: Path, pelvis: np.ndarray) -> SmplArrays:
     else:
         poses = _whole_poses(path, found)
     _same_count(path, root[1] if root else "poses", poses, translations, moves)
-    poses = poses[:, : 3 * JOINTS].reshape(len(poses), JOINTS, 3).astype(np.float32)
+    kept = joints if poses.shape[1] == 3 * joints else JOINTS
+    poses = poses[:, : 3 * kept].reshape(len(poses), kept, 3).astype(np.float32)
     largest = float(np.linalg.norm(poses, axis=-1).max(initial=0))
     if largest > 4 * np.pi:
         raise DataError(path, f"poses: expected radians, got turns of {largest:.0f}.", "Convert degrees first.")
@@ -74,24 +77,24 @@ def read_smpl_arrays(path: Path, pelvis: np.ndarray) -> SmplArrays:
 
 
 def read_betas(path: Path) -> np.ndarray | None:
-    """The shape coefficients ``(T, B)`` or ``(1, B)`` in a file of `read_smpl_arrays`; None where it has none."""
+    """Shape coefficients ``(T, B)`` or ``(1, B)`` in a file of `read_smpl_arrays`; None where it has none."""
     found = _read_keys(path, SHAPES)
     return next((_frames(path, key, array) for key, array in found.items()), None)
 
 
 def _read_keys(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
     """Arrays of numbers under the keys that are there."""
-    if path.suffix.lower() != ".json":
+    suffix = path.suffix.lower()
+    if suffix not in (".json", ".pkl"):
         return read_arrays(path, {}, {key: f"number {_private(key)}" for key in keys})
-    record, found = read_json_record(path), {}
-    for key in keys:
-        if key in record:
-            try:
-                found[key] = np.array(record[key], np.float64)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise DataError(path, f"{key}: expected numbers in lists, got others ({error!s:.100}).") from error
-            with naming(path):
-                check_finite(key, found[key])
+    record, found = read_json_record(path) if suffix == ".json" else read_pickled_arrays(path, (), keys), {}
+    for key in (key for key in keys if key in record):
+        try:
+            found[key] = np.array(record[key], np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise DataError(path, f"{key}: expected numbers in lists, got others ({error!s:.100}).") from error
+        with naming(path):
+            check_finite(key, found[key])
     return found
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.checks import DataError, check_file, check_suffix
+from avatar.checks import DataError, check_file, check_finite, check_suffix
 from avatar.io.gltf import (
     MAX_BYTES,
     TRIANGLES,
@@ -20,8 +20,10 @@ from avatar.io.gltf import (
     scene_nodes,
     skin_joints,
 )
+from avatar.io.npz import naming
 
 RIG_SUFFIXES = (".glb", ".gltf")
+MAX_WEIGHTS = 1 << 28  # vertices times joints
 SAME = 1e-4  # of a mesh's size: by how much two meshes of one skeleton may be bound differently
 
 
@@ -76,6 +78,10 @@ def _read(scene: Scene) -> Rig:
         hint = "Hint: export the mesh with its armature and skinning weights."
         raise DataError(scene.path, "expected a skinned mesh with triangles, got none.", hint)
     first = next(iter(skins))
+    with naming(scene.path):
+        check_finite("inverse bind matrices", skins[first])
+        for part in parts:
+            check_finite("vertices", part.vertices)
     nodes = scene.item("skins", first)["joints"]
     order, parents = _joint_order(scene, nodes)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -122,6 +128,8 @@ def _bound_parts(scene: Scene, mesh: int, joints: np.ndarray, transform: np.ndar
         if mode < TRIANGLES:
             continue
         vertices = read_accessor(scene, attributes["POSITION"], "VEC3")
+        if len(vertices) * len(joints) > MAX_WEIGHTS:
+            raise DataError(scene.path, f"expected a person, got {len(vertices)} vertices and {len(joints)} joints.")
         ids, values = read_influences(scene, attributes, len(joints), len(vertices))
         weights = np.zeros((len(vertices), len(joints)))
         np.add.at(weights, (np.arange(len(ids))[:, None], ids), values)

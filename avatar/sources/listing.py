@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from avatar.body.inert_pickle import read_pickled_arrays
 from avatar.body.packed import holds_template
 from avatar.checks import DataError, plain_name
 from avatar.data.folders import SPLITS
@@ -17,7 +18,8 @@ from avatar.io.rigs import RIG_SUFFIXES
 from avatar.io.surfaces import READERS
 from avatar.sources.base import SourceFrame
 
-ARRAYS = (".npz", ".json")
+ARRAYS = (".npz", ".json", ".pkl")
+LARGEST_PICKLE = 16 << 20  # bytes; body parameters have some kilobytes, models more
 PASSED = {  # endings of what belongs to scans and is not read: materials, buffers, textures, notes
     *(".mtl", ".bin", ".png", ".jpg", ".jpeg", ".tga", ".bmp", ".tif", ".tiff", ".exr", ".webp", ".dds", ".ktx2"),
     *(".txt", ".md", ".pdf", ".html", ".yaml", ".yml", ".csv", ".log", ".ini", ".db", ".blend"),
@@ -151,23 +153,23 @@ def own_stem(path: Path) -> str:
 
 
 def array_kind(path: Path) -> str:
-    """What an npz or JSON file holds by its keys: body, parameters, vertices; empty for anything else."""
-    if path.suffix.lower() == ".json":
-        try:
+    """What an npz, JSON or pickled file holds by its keys: body, parameters, vertices; empty for anything else."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".json":
             keys = set(read_json_record(path))
-        except DataError:
-            return ""
-    else:
-        try:
+        elif suffix == ".pkl":
+            keys = set(read_pickled_arrays(path, (), KEYS)) if path.stat().st_size <= LARGEST_PICKLE else set()
+        else:
             with zipfile.ZipFile(path) as archive:
                 keys = {name.removesuffix(".npy") for name in archive.namelist()}
-        except (zipfile.BadZipFile, OSError):
-            return ""
-        if holds_template(path) or {"v_template", "J_regressor"} <= keys:
-            return "body"
+    except (DataError, zipfile.BadZipFile, OSError):
+        return ""
+    if suffix == ".npz" and ({"v_template", "J_regressor"} <= keys or holds_template(path)):
+        return "body"
     if keys & set(KEYS):
         return "parameters"
-    return "vertices" if path.suffix.lower() == ".npz" and keys & set(VERTEX_KEYS) else ""
+    return "vertices" if suffix == ".npz" and keys & set(VERTEX_KEYS) else ""
 
 
 def _is_body(mesh: Path, stems: set[str]) -> bool:

@@ -41,6 +41,7 @@ from avatar.sources.placement import FittedSample, Placement, StandingBody, find
 
 SAMPLES = 8  # frames from which units and axes are found
 SAMPLE_POINTS = 20_000  # of each scan
+SHOWN = 5  # names of files that are left out
 SHAPE_SAMPLES = 16  # files that shape coefficients are read from
 SHAPES_DIFFER = 0.05  # standard deviations
 FOREIGN = 0.01  # metres, root mean square, from a body mesh to the nearest pose of the body
@@ -79,9 +80,11 @@ class PlainScans(Source):
     @cached_property
     def frames(self) -> tuple[SourceFrame, ...]:
         """Frames sorted by split, sequence and number. Raises `DataError` for two scans of one name."""
-        if unknown := self._unknown:
-            kinds = ", ".join(sorted({path.suffix.lower() or path.name for path in unknown}))
-            log.warning("%s: %d files of unknown kinds are left out: %s.", self.path, len(unknown), kinds)
+        if unknown := [path.name for path in self._unknown]:
+            names = ", ".join(unknown[:SHOWN]) + ", ..." * (len(unknown) > SHOWN)
+            log.warning(
+                "%s: %d files that nothing is known of, or damaged, are left out: %s.", self.path, len(unknown), names
+            )
         return tuple(
             replace(frame, files=(*frame.files, *dict.fromkeys(fit.path for fit in self._fits[frame.name])))
             for frame in self._scans
@@ -164,7 +167,7 @@ class PlainScans(Source):
 
     @cached_property
     def _arrays(self) -> dict[Path, str]:
-        """Kinds of the npz and JSON files: parameters, vertices, body; those that hold nothing of it are left out."""
+        """Kinds of the npz, JSON and pickled files: parameters, vertices, body; others are left out."""
         others = [path for folder in self._folders for path in folder.others]
         found = [path for path in dict.fromkeys([*others, *self._fit_files]) if path.suffix.lower() in ARRAYS]
         return {path: kind for path in found if (kind := array_kind(path))}
@@ -275,7 +278,7 @@ class PlainScans(Source):
         _check_count(fit, len(arrays.poses))
         pose, translation = arrays.poses[fit.place], arrays.translations[fit.place]
         if list(self.body.joint_names[: len(SMPL_JOINTS)]) != SMPL_JOINTS:
-            motion = Motion(pose[None], translation[None], 1.0, fit.path.stem)
+            motion = Motion(pose[None, : len(SMPL_JOINTS)], translation[None], 1.0, fit.path.stem)
             pose = move_body(motion, self.body).poses[0]
         return pose, translation
 
@@ -299,7 +302,8 @@ class PlainScans(Source):
             if len(self._kept) > 1:
                 self._kept.clear()
             parameters = self._arrays[path] == "parameters"
-            self._kept[path] = read_smpl_arrays(path, self._pelvis) if parameters else _read_vertices(path)
+            joints = len(self.body.parents)
+            self._kept[path] = read_smpl_arrays(path, self._pelvis, joints) if parameters else _read_vertices(path)
         return self._kept[path]
 
     @cached_property

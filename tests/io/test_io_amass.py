@@ -1,6 +1,8 @@
 """Array files of motions under the keys, shapes, axes and units that trackers and tools write."""
 
+import json
 import logging
+import pickle
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from avatar.body.model import SMPL_JOINTS
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError
+from avatar.io.amass import read_betas, read_smpl_arrays
 from avatar.io.motions import MotionConfig, read_body_motion, read_motion, write_motion
 from avatar.records import Motion
 from avatar.simulate.angles import authored_motion
@@ -265,3 +268,34 @@ def test_options_that_a_format_has_no_use_for_are_refused(tmp_path, walk):
     for ending, hint in ((".amc", "Blender"), (".fbx", "Blender"), (".pkl", "numpy.savez")):
         with pytest.raises(DataError, match=rf"ending in \.npz or \.bvh, got '{ending}'\. .*{hint}"):
             read_motion(tmp_path / f"a{ending}")
+
+
+def test_body_parameters_of_json_and_pickles(walk, tmp_path):
+    """EasyMocap's and smplx's records of one frame, and SMPLify-X's pickles; several people are refused."""
+    arrays, pelvis = smpl_arrays(walk), np.zeros(3)
+    record = {"global_orient": arrays["root"][:1], "body_pose": arrays["body"][:1], "transl": arrays["trans"][:1]}
+    record["betas"] = np.arange(10.0)[None]
+    plain = {key: value.tolist() for key, value in record.items()}
+    texts = {"a.json": plain, "b.json": [plain], "c.json": {"annots": [plain | {"id": 0}]}}
+    for name, content in texts.items():
+        (tmp_path / name).write_text(json.dumps(content))
+    (tmp_path / "d.pkl").write_bytes(pickle.dumps(record))
+    for name in (*texts, "d.pkl"):
+        read = read_smpl_arrays(tmp_path / name, pelvis)
+        np.testing.assert_allclose(read.poses[0, 0], arrays["root"][0], atol=1e-6)
+        np.testing.assert_array_equal(read_betas(tmp_path / name), record["betas"])
+    (tmp_path / "a.json").write_text(json.dumps([plain, plain]))
+    with pytest.raises(DataError, match="expected one person, got 2"):
+        read_smpl_arrays(tmp_path / "a.json", pelvis)
+    for wrong in ([["x"]], [[1.0], [1.0, 2.0]], [[None]], [[float("nan")] * 3]):
+        (tmp_path / "a.json").write_text(json.dumps(plain | {"transl": wrong}))
+        with pytest.raises(DataError, match=r"a\.json: transl"):
+            read_smpl_arrays(tmp_path / "a.json", pelvis)
+
+
+def test_hands_are_kept_for_a_body_of_just_those_joints(walk, tmp_path):
+    arrays = smpl_arrays(walk)
+    np.savez(tmp_path / "hands.npz", poses=wide(arrays, 156), trans=arrays["trans"])
+    assert read_smpl_arrays(tmp_path / "hands.npz", np.zeros(3), 52).poses[0, 22:] == pytest.approx(0.3)
+    for joints in (22, 55):
+        assert read_smpl_arrays(tmp_path / "hands.npz", np.zeros(3), joints).poses.shape[1] == 22

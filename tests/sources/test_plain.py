@@ -132,7 +132,7 @@ def test_what_is_finished_is_not_made_again(outfit, parameters, frames):
 
 def test_other_files_are_named(outfit, caplog):
     assert len(opened(outfit[0]).frames) == 4
-    assert "1 files of unknown kinds are left out: .xyz." in caplog.text
+    assert "1 files that nothing is known of, or damaged, are left out: notes.xyz." in caplog.text
 
 
 def test_parameters_of_each_scan_as_json(frames, template, tmp_path):
