@@ -38,6 +38,7 @@ LAYERS = {
     "methods": 4,
     "training": 5,
     "export": 5,
+    "fitting": 5,
     "evaluation": 5,
     "runs": 6,
     "pipeline": 7,
