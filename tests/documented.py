@@ -101,6 +101,7 @@ SHORT = {
         *CLOTHED,
     ),
     "bench": ("quick=true", "repeats=1", "memory=false"),
+    "fit_bodies": ("outfits=[tee]", "frames=1", "fitting.headings=2"),
     "check_reliability": ("only=[fuzz]", "files=50"),
 }
 
@@ -140,6 +141,7 @@ PROMISED = {
     "demo": ["runs/demo/summary.json", "runs/layered/sample/{outfit}/demo/report.html"],
     "simulate": ["data/open/*/manifest.json"],
     "bench": ["**/bench.csv", "**/bench.md"],
+    "fit_bodies": ["**/fitting.csv", "**/fitting.md"],
     "check_reliability": ["**/reliability.csv"],
     "parameters": ["**/parameters.csv", "**/parameters.md"],
     "convert_body": ["{1}"],

@@ -32,7 +32,7 @@ def test_a_scan_at_a_known_distance_has_that_distance(body):
     vertices, normals, faces, head = body
     over = measure_fit(PointCloud(vertices + 0.008 * normals, normals), vertices, normals, faces, head, 1.0)
     assert over.outside_median == pytest.approx(0.008, abs=5e-4) and over.inside_share < 0.01
-    assert over.bare_median == pytest.approx(0.008, abs=1e-3) and over.covered_share > 0.98
+    assert over.bare_median == pytest.approx(0.008, abs=1e-3) and over.covered_share > 0.96
     inside = measure_fit(PointCloud(vertices - 0.015 * normals, normals), vertices, normals, faces, head, 1.0)
     assert inside.inside_share > 0.5
     upper = vertices[:, 1] > np.median(vertices[:, 1])

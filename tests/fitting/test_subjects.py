@@ -132,10 +132,8 @@ def test_cloth_outside_the_skin_does_not_make_the_body_larger(clothed, clothing)
     start.translation[:] = torch.from_numpy(skin.mean(axis=0)) - PosedFamily(family, start).points()[0].mean(dim=0)
     with torch.no_grad():
         fit, _ = Registration(family, config).fit_one(prepare_samples(cloud, config), start=start)
-    posed = PosedFamily(family, fit)
-    outward = posed.normals(family.normals)[0].numpy()
-    growth = np.median(((posed.points()[0].detach().numpy() - skin) * outward).sum(axis=1))
-    assert abs(growth) < 0.003 if clothing else growth > 0.005
+    growth = float(fit.shape)  # of the size, 3% a standard deviation
+    assert abs(growth) < 0.15 if clothing else growth > 0.3
 
 
 @pytest.mark.parametrize(
@@ -143,7 +141,7 @@ def test_cloth_outside_the_skin_does_not_make_the_body_larger(clothed, clothing)
     [
         (lambda p, n: (p[:500], n[:500]), "one: expected at least 2000 points, got 500"),
         (lambda p, n: (np.where(np.arange(len(p))[:, None] == 7, np.nan, p), n), r"3 NaN or infinite .* \(7, 0\)"),
-        (lambda p, n: (100 * p, n), "got a largest extent of 16.* Hint: the unit may be"),
+        (lambda p, n: (100 * p, n), "got a largest extent of 174.5. Hint: the unit may be cm"),
         (lambda p, n: (p, 0.3 * n), "one: expected unit normals, got lengths off by 0.7"),
     ],
 )
