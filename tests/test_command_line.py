@@ -28,7 +28,11 @@ from avatar.progress import Progress
 from avatar.verbs import VERBS, typed_words
 
 ROOT = Path(__file__).parents[1]
-OUTSIDE = {"bench": "benchmarks:BENCH", "check_reliability": "reliability:CHECK_RELIABILITY"}  # not in the package
+OUTSIDE = {  # not in the package
+    "bench": "benchmarks:BENCH",
+    "fit_bodies": "benchmarks:FIT_BODIES",
+    "check_reliability": "reliability:CHECK_RELIABILITY",
+}
 CALLED = {typed_words(verb)[0] for verb in VERBS}  # verbs, and groups of verbs
 TOOLS = sorted(path for path in (ROOT / "tools").glob("*.py") if path.stem in CALLED or path.stem in OUTSIDE)
 SHORT = ["dataset=open", "outfit=tiny", "method=static", "train.points=500", "train.scan_points=500", "train.batch=1"]

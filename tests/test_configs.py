@@ -19,7 +19,7 @@ from avatar.config import compose_settings as load
 from avatar.methods.registry import find_method
 from avatar.settings import settings_from_dict, settings_to_dict
 from avatar.verbs import VERBS, resolve, typed_words
-from benchmarks import BENCH
+from benchmarks import BENCH, FIT_BODIES
 from reliability import CHECK_RELIABILITY
 
 ROOT = Path(__file__).parents[1]
@@ -27,7 +27,7 @@ EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SIZES = sorted(path.stem for path in (CONF / "size").glob("*.yaml"))
 WITH_SETTINGS = {name: verb for name, verb in VERBS.items() if verb.settings}
-WITH_SETTINGS |= {"bench": BENCH, "check_reliability": CHECK_RELIABILITY}
+WITH_SETTINGS |= {"bench": BENCH, "fit_bodies": FIT_BODIES, "check_reliability": CHECK_RELIABILITY}
 
 
 @pytest.mark.parametrize("name", WITH_SETTINGS)

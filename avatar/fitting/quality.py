@@ -38,6 +38,7 @@ class FitQuality:
         """What misses its limit, with the figures; none for a good fit."""
         missed = (
             (self.inside_share > limits.inside, f"{self.inside_share:.1%} of the scan inside the body"),
+            (np.isnan(self.bare_median), "no scan at head, hands and feet"),
             (self.bare_median > limits.bare, f"head, hands and feet {1000 * self.bare_median:.0f} mm from the scan"),
             (self.covered_share < limits.covered, f"the scan covers {self.covered_share:.0%} of the body"),
             (self.objective > limits.objective, f"objective {self.objective:.0f}"),

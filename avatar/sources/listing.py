@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avatar.body.inert_pickle import read_pickled_arrays
@@ -82,10 +82,19 @@ def list_folders(path: Path, fits: Path | None = None) -> list[ScanFolder]:
 def list_frames(folders: Sequence[ScanFolder]) -> list[SourceFrame]:
     """The scans of folders as frames, sorted by split, sequence and number, without the files of their bodies.
 
-    Scans whose names differ in their number alone are a sequence, and named ``<sequence>.<number>``. Raises `DataError`
-    for two scans of one name, also where only their endings or their case differ.
+    Scans whose names differ in their number alone are a sequence, and named ``<sequence>.<number>``; names that several
+    splits have begin with the split. Raises `DataError` for two scans of one name, also where only their endings or
+    their case differ.
     """
     frames = [frame for folder in folders for frame in _folder_frames(folder)]
+    splits: dict[str, set[str]] = {}
+    for frame in frames:
+        splits.setdefault(frame.name.lower(), set()).add(frame.split)
+    shared = {name for name, found in splits.items() if len(found) > 1}
+    frames = [
+        replace(frame, name=plain_name(f"{frame.split}-{frame.name}", "")) if frame.name.lower() in shared else frame
+        for frame in frames
+    ]
     names: dict[str, Path] = {}
     for frame in frames:
         other = names.setdefault(frame.name.lower(), frame.files[0])

@@ -96,7 +96,9 @@ class PlainScans(Source):
         given, beside = self.config.body, self._body_file
         if beside is None:
             return None
-        whole = given.all_joints is not False
+        whole = given.all_joints
+        if whole is None:  # parameters are read for 22 joints, meshes show the hands as well
+            whole = not any(fit.kind == "parameters" for fits in self._fits.values() for fit in fits)
         settings = {"canonical": given.canonical, "all_joints": whole, "betas": list(given.betas)}
         if not given.betas and beside.suffix.lower() == ".npz" and not holds_template(beside):
             settings["betas"] = self._betas

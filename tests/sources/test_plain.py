@@ -301,5 +301,5 @@ def test_units_that_fit_no_person(frames, tmp_path):
 
 def test_a_folder_without_scans(tmp_path):
     (tmp_path / "readme.txt").write_text("nothing")
-    with pytest.raises(DataError, match=r"expected files of layout one of .*plain"):
+    with pytest.raises(DataError, match=r"expected files of one of the layouts .*plain"):
         open_sources(config(tmp_path))
