@@ -42,22 +42,8 @@ def posed_vertices(body: BodyModel, pose: np.ndarray, translation: np.ndarray | 
 
 
 def solve_poses(body: BodyModel, vertices: np.ndarray) -> SolvedPoses:
-    """The poses and translations with which a body's vertices lie nearest to ``vertices (B, V, 3)``, least squares.
-
-    Linear blend skinning is linear in the joints' motions, so affine motions are solved for first, for all frames at
-    once; the nearest rotations of a kinematic tree start Gauss-Newton steps on pose and translation, in which pose
-    blendshapes are those of the step before. Vertices that the body itself was posed to are met to rounding; for those
-    of another shape ``residuals`` say how far off the result is. Raises `AvatarError` for another number of vertices or
-    numbers that are not finite.
-    """
-    dims = check_shape("vertices", vertices, "B V 3", V=len(body.bind_vertices))
-    check_finite("vertices", vertices)
-    solver, parents = _Solver(body), body.parents
-    poses, translations, residuals = np.zeros((dims["B"], len(parents), 3)), np.zeros((dims["B"], 3)), []
-    for frame, wanted in enumerate(np.asarray(vertices, np.float64)):
-        poses[frame], translations[frame], residual = solver.solve(wanted)
-        residuals.append(residual)
-    return SolvedPoses(poses.astype(np.float32), translations.astype(np.float32), np.array(residuals))
+    """The poses of a body in given frames, as `PoseSolver` solves for them."""
+    return PoseSolver(body).solve(vertices)
 
 
 class _Fit(NamedTuple):
@@ -77,8 +63,13 @@ class _Posed(NamedTuple):
     above: np.ndarray
 
 
-class _Solver:
-    """A body's arrays in float64, and the factorised normal equations of its joints' affine motions."""
+class PoseSolver:
+    """Poses and translations with which a body's vertices lie nearest to given ones, prepared once for many frames.
+
+    Linear blend skinning is linear in the joints' motions, so affine motions are solved for first; the nearest
+    rotations of a kinematic tree start Gauss-Newton steps on pose and translation, in which pose blendshapes are those
+    of the step before.
+    """
 
     def __init__(self, body: BodyModel):
         kept = ("weights", "zero_from_bind", "bind_vertices", "zero_joints", "pose_directions")
@@ -104,7 +95,20 @@ class _Solver:
         normal = design.T @ design + scale * np.kron(pull.T @ pull, np.eye(4)) + 1e-12 * np.eye(4 * count)
         self.affine = np.linalg.solve(normal, design.T)
 
-    def solve(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    def solve(self, vertices: np.ndarray) -> SolvedPoses:
+        """The poses nearest to ``vertices (B, V, 3)``, metres, by least squares.
+
+        Vertices that the body itself was posed to are met to rounding; for those of another shape ``residuals`` say how
+        far off the result is. Raises `AvatarError` for another number of vertices or numbers that are not finite.
+        """
+        check_shape("vertices", vertices, "B V 3", V=len(self.bind))
+        check_finite("vertices", vertices)
+        solved = [self._solve_frame(frame) for frame in np.asarray(vertices, np.float64)]
+        poses = np.array([pose for pose, _, _ in solved], np.float32).reshape(-1, len(self.parents), 3)
+        translations = np.array([translation for _, translation, _ in solved], np.float32).reshape(-1, 3)
+        return SolvedPoses(poses, translations, np.array([residual for *_, residual in solved]))
+
+    def _solve_frame(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Pose ``(J, 3)``, translation ``(3,)`` and residual of one frame's vertices ``(V, 3)``."""
         motions = (self.affine @ wanted).reshape(-1, 4, 3).transpose(0, 2, 1)  # posed_from_zero (J, 3, 4)
         left, _, right = np.linalg.svd(motions[:, :, :3])

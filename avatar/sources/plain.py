@@ -13,7 +13,7 @@ import numpy as np
 from avatar.body.model import SMPL_JOINTS, BodyModel
 from avatar.body.packed import holds_template
 from avatar.body.registry import body_of_file
-from avatar.body.solving import posed_vertices, solve_poses
+from avatar.body.solving import PoseSolver, posed_vertices
 from avatar.checks import DataError, plain_name
 from avatar.invocation import command_line, option
 from avatar.io.amass import SmplArrays, read_betas, read_smpl_arrays
@@ -128,7 +128,7 @@ class PlainScans(Source):
                 posed = replace(posed, vertices=placement.fit(self._vertices(fit)))
         if posed.vertices is None or posed.pose is not None:
             return posed
-        solved = solve_poses(self.body, posed.vertices[None])
+        solved = self._solver.solve(posed.vertices[None])
         if solved.residuals[0] > FOREIGN:
             apart = 1000 * solved.residuals[0]
             problem = f"expected the body in some pose, got a mesh {apart:.0f} mm from the nearest."
@@ -269,6 +269,10 @@ class PlainScans(Source):
         if (spread := float(np.ptp(every, axis=0).max(initial=0))) > SHAPES_DIFFER:
             log.warning("%s: shape coefficients differ by %.2g; their mean is taken for all.", self.path, spread)
         return [float(value) for value in every.mean(axis=0)]
+
+    @cached_property
+    def _solver(self) -> PoseSolver:
+        return PoseSolver(self.body)
 
     @property
     def _pelvis(self) -> np.ndarray:
