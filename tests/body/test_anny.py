@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avatar.body.model import SMPL_JOINTS
-from avatar.body.open import MIXAMO_NAMES, Phenotype, anny_body, anny_template
+from avatar.body.open import MIXAMO_NAMES, Phenotype, anny_body, anny_template, build_anny
 from avatar.checks import AvatarError
 
 FINGER = "LeftHandIndex1"
@@ -39,7 +39,10 @@ class StandIn:
 
 @pytest.fixture
 def anny(monkeypatch):
+    build_anny.cache_clear()
     monkeypatch.setattr("avatar.body.open.require", lambda name: SimpleNamespace(Anny=StandIn))
+    yield
+    build_anny.cache_clear()
 
 
 def test_template_is_y_up_with_fingers_in_the_hand(anny):

@@ -55,6 +55,8 @@ class FitBodiesConfig:
         for name, value, known in (("scanner", self.scanner, SCANNERS), ("split", self.split, SPLITS)):
             if value not in known:
                 raise unknown_name(name, value, known)
+        if not self.outfits:
+            raise AvatarError("outfits: expected at least one, got none.")
         check_range(self, "frames", low=1)
         if not SAFE_NAME.fullmatch(self.table):
             raise AvatarError(f"table: expected a plain name, got {self.table!r}.")
@@ -76,15 +78,13 @@ def fit_bodies(config: FitBodiesConfig) -> Path:
     Writes ``<out>/<table>.csv``, ``.frames.csv`` and ``.md``, in which other outfits and variants keep their rows, and
     ``<out>/<table>/<data set>_<outfit>_<variant>/``: a quality report and, if asked for, pictures. Gives the Markdown.
     """
-    scores = Scores()
+    path = config.out / f"{config.table}.csv"
     for name in config.outfits:
         outfit = find_outfit(config.data, config.dataset, name, SCANNERS[config.scanner])
-        scores += fit_outfit(outfit, config)
-    path = config.out / f"{config.table}.csv"
-    scores = keep_others(path, scores)
-    write_scores(path, scores)
-    text = to_markdown(scores.rows)
-    write_whole(path.with_suffix(".md"), text.encode())
+        scores = keep_others(path, fit_outfit(outfit, config))
+        write_scores(path, scores)  # after each outfit, so that an interrupted run keeps those finished
+        text = to_markdown(scores.rows)
+        write_whole(path.with_suffix(".md"), text.encode())
     print(f"{text}\nwritten: {config.out / config.table}.*")
     return path.with_suffix(".md")
 
