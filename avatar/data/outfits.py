@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
@@ -20,6 +21,8 @@ from avatar.data.validation import check_frame, check_joints, check_pose, check_
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Template
 
+log = logging.getLogger(__name__)
+
 
 class Outfit(ABC):
     """One person in one set of clothes: frames of scans with the body under them.
@@ -29,6 +32,7 @@ class Outfit(ABC):
 
     def __init__(self, path: Path, dataset: str = ""):
         self.held_back: tuple[str, ...] = ()
+        self._doubted: set[str] = set()
         self.path = Path(path)
         self.name = self.path.name
         self.dataset = dataset or self.path.parent.name
@@ -73,11 +77,15 @@ class Outfit(ABC):
     def load(self, split: str, name: str) -> Frame:
         """One frame, checked: finite, in metres, scan over body.
 
-        Raises `AvatarError` for a frame that is not in the split, naming near ones; `DataError` for an invalid file.
+        What is doubtful is logged, each kind of it once an outfit. Raises `AvatarError` for a frame that is not in the
+        split, naming near ones; `DataError` for an invalid file.
         """
         path = self.frame_path(split, name)
         frame = self._read_frame(path, split, name)
-        check_frame(frame, self.template, path)
+        for kind, doubt in check_frame(frame, self.template, path).items():
+            if kind not in self._doubted:
+                self._doubted.add(kind)
+                log.warning("%s: %s (Others like it are not mentioned.)", path, doubt)
         return frame
 
     def load_body(self, split: str, name: str) -> BodyFit:

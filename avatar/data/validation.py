@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,24 +10,42 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.packed import border_positions
 from avatar.checks import AvatarError, DataError, check_finite
-from avatar.geometry.trees import build_tree
+from avatar.data.alignment import (
+    FAR,
+    INSIDE_OUT,
+    NEAR,
+    UNORIENTED,
+    Overlap,
+    ScanSamples,
+    Similarity,
+    Skin,
+    find_stray,
+    fit_similarity,
+    sample_skin,
+    show_vector,
+    suggest_hint,
+    thin,
+    tight_weights,
+)
 from avatar.records import Frame, Scan, Template
 
-SKIN_SAMPLES = 500  # places on the body, spread by area
-SCAN_SAMPLES = 4_000
-DEEP_SAMPLES = 500  # scan points whose side of the skin is looked at
-NEAR = 0.10  # metres from skin to scan; a wide dress is farther from the legs, and near everywhere else
-DEEP = 0.03  # metres under the skin, beyond what a good fit leaves
-CURED, CURED_BURIED = 0.9, 0.05  # share of the body that a suggestion must bring near the scan, and of scan buried
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
 UNITS = {"centimetres": 100, "millimetres": 1000}  # in a metre
 FEWEST_POINTS = 100
 FAR_OFF = 10.0  # metres between the middles of scan and body that only a translation in other units explains
-# A valid frame covers 94% and more of the body, long dresses and raw scans included, and buries nothing.
+# Valid frames (sample, dress, skirt, jacket; perfect and raw scans, all poses) cover 92% and more of the
+# body, bury 0.2% at most, and 93% of their normals point outward.
 LEAST_COVERED, MOST_BURIED = 0.6, 0.05  # each alone is a misfit
 DOUBTFUL_COVERED, DOUBTFUL_BURIED, DOUBTFUL_OUTWARD = 0.85, 0.01, 0.8  # the first with one of the others
-INSIDE_OUT, UNORIENTED = 0.25, 0.7  # shares of normals that point outward
+WOUND, DOUBTFUL_WOUND = 0.7, 0.9  # shares of faces wound as their normals say; 0.99 in raw meshes
+# At head, hands and feet valid scans lie within 1.4 cm on average (2.1 cm with hair and shoes added), and have 0.1%
+# (2.7%) of another size, 0.3 (0.8) degrees of turn and 0.2 cm (0.8 cm) of shift. The first is a doubt, the second
+# refused.
+SCALE, TURN, SHIFT = (0.04, 0.08), (4.0, 10.0), (0.03, 0.06)  # share, degrees, metres
+APART_TIGHT = (0.025, 0.10)  # metres of mean distance
+MAJORITY, NEARLY_ALL = 0.5, 0.8  # shares of the places there on the scan: a gown may hide the feet
+STRAY, STRAY_SPREAD = 2e-3, 2e-5  # share of points, or square metres that they add to a Chamfer distance: refused
 ALONG = 0.7  # cosine to an axis from which on a direction runs along it
 MOST_TURN = 2 * np.pi + 0.1  # radians; no joint turns farther, and degrees soon exceed it
 JOINT_GAP, JOINTS_GAP = 0.25, 0.12  # metres from a joint to its weights' border: one, median (open body: 0.13, 0.04)
@@ -69,6 +86,12 @@ def _check_axes(template: Template, path: Path) -> None:
             problem = f"joints: expected {end} towards {wanted} from {start}, it lies towards {found or 'no axis'}."
             hint = TURNS.get((wanted, found), "Turn body and scans so that y is up and the body faces +z.")
             raise DataError(path, problem, hint)
+    vertices, faces = template.vertices.double(), template.faces
+    a, b, c = (vertices[faces[:, corner]] - vertices.mean(dim=0) for corner in range(3))
+    if (volume := float((a * b.cross(c, dim=1)).sum()) / 6) < 0:
+        problem = f"faces: expected them counter-clockwise from outside, they enclose {volume:.3f} m³: wound inward."
+        hint = "Swap two columns of the faces; or, if the body is mirrored as well, negate x of the vertices instead."
+        raise DataError(path, problem, hint)
     _, height, depth = np.ptp(template.vertices.numpy(), axis=0)
     if height < depth / 2:
         problem = f"vertices: expected a body that stands along y, it is {height:.2f} m high and {depth:.2f} m deep."
@@ -120,25 +143,32 @@ def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: 
         return "The weights of left and right look swapped: exchange their columns, or the joints' names."
     shift = np.median(borders - joints, axis=0)
     if fit(joints + shift):
-        return f"Moving all joints by {_vector(shift)} m would lay them there."
+        return f"Moving all joints by {show_vector(shift)} m would lay them there."
     return "Are joints in the order of the weights' columns, at rest, in metres, in the vertices' coordinates?"
 
 
-def check_frame(frame: Frame, template: Template, path: Path) -> None:
-    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out."""
+def check_frame(frame: Frame, template: Template, path: Path) -> dict[str, str]:
+    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out.
+
+    Gives what is doubtful and read all the same, as messages by kind. Raises `DataError` with the measured figure and
+    the likely cause.
+    """
     scan, body, faces = frame.scan, frame.body.vertices, template.faces.numpy()
     if len(scan.points) < FEWEST_POINTS:
         problem = f"scan: expected at least {FEWEST_POINTS} points, got {len(scan.points)}."
         raise DataError(path, problem, "Leave the frame out or scan it again.")
     check_size(body, template, path)
-    _check_ratio("scan", scan.points, body, "the body", path)
     lengths = np.linalg.norm(scan.normals, axis=1)
-    if (np.abs(lengths - 1) > 0.05).mean() > 0.01:
+    if lengths.min() < 0.5 or (np.abs(lengths - 1) > 0.05).mean() > 0.01:
         problem = f"scan normals: expected unit length, got {lengths.min():.3g} to {lengths.max():.3g}."
         raise DataError(path, problem, "Normalise them, or compute them anew.")
-    overlap = measure_overlap(scan.points, scan.normals, body, faces)
-    _check_overlap(overlap, scan, body, faces, path)
-    _check_normals(overlap, scan, path)
+    tight = tight_weights(template)
+    samples, skin = ScanSamples(scan.points, scan.normals), sample_skin(body, faces, tight)
+    ends = np.quantile(samples.points, [0.02, 0.98], axis=0)  # whatever a few stray points say
+    _check_ratio("scan", ends, body, "the body", path)
+    doubts = _check_overlap(samples, skin, scan, body, template, path)
+    doubts |= _check_stray(scan, skin, path)
+    return doubts | _check_normals(samples.overlap(skin), scan, path)
 
 
 def check_size(body: np.ndarray, template: Template, path: Path) -> None:
@@ -161,129 +191,125 @@ def _unit_hint(size: float) -> str:
             return f"That looks like {unit}: divide positions and translations by {factor} (multiply by {1 / factor})."
     if BODY_HEIGHT[0] <= size * 1000 <= 2 * BODY_HEIGHT[1]:
         return "That looks like kilometres, or metres scaled twice: multiply positions and translations by 1000."
-    return "Positions must be in metres with y up."
+    return "Positions must be in metres with y up, and a scan must hold nothing but the person."
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """Shares: of skin with a scan point near, of scan deep under the skin, of scan normals that point as it does."""
-
-    covered: float
-    buried: float
-    outward: float
-
-
-def measure_overlap(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Overlap:
-    """How scan points ``(M, 3)`` lie over a body ``(V, 3)`` with faces ``(F, 3)``; looks at some of each, in 10 ms."""
-    centres, outward, skin = _face_frames(vertices, faces)
-    some = _thin(len(points), DEEP_SAMPLES)
-    _, below = build_tree(centres).query(points[some])
-    heights = ((points[some] - centres[below]) * outward[below]).sum(axis=1)
-    return Overlap(
-        covered=_coverage(points)(skin),
-        buried=float((heights < -DEEP).mean()),
-        outward=float(((normals[some] * outward[below]).sum(axis=1) > 0).mean()),
-    )
-
-
-def _face_frames(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres and unit normals of faces ``(F, 3)``, and centres ``(S, 3)`` at even steps of the area, in float64.
-
-    Hands are a small part of the area, and a large one of the faces.
-    """
-    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
-    crosses = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(crosses, axis=1)
-    centres, areas = (a + b + c) / 3, (lengths / 2).cumsum()
-    places = np.searchsorted(areas, (np.arange(SKIN_SAMPLES) + 0.5) / SKIN_SAMPLES * areas[-1])
-    return centres, crosses / np.maximum(lengths, 1e-20)[:, None], centres[places.clip(max=len(areas) - 1)]
-
-
-def _thin(count: int, most: int) -> np.ndarray:
-    """At most so many indices below a count, evenly."""
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
-
-
-def _coverage(points: np.ndarray) -> Callable[[np.ndarray], float]:
-    """What measures the share of places on the skin with one of a scan's points within reach."""
-    some = points[_thin(len(points), SCAN_SAMPLES)]
-    tree, spacing = build_tree(some), np.sqrt(2 / len(some))  # of points on two square metres of person
-    reach = max(NEAR, 2 * spacing)
-    return lambda skin: float(np.isfinite(tree.query(skin, distance_upper_bound=reach)[0]).mean())
-
-
-def _check_overlap(overlap: Overlap, scan: Scan, body: np.ndarray, faces: np.ndarray, path: Path) -> None:
-    """Refuses a scan that does not lie over its body, with the move or turn that would lay it there."""
-    inside_out = overlap.outward < INSIDE_OUT
-    doubtful = overlap.covered < DOUBTFUL_COVERED and (
-        overlap.buried > DOUBTFUL_BURIED or (overlap.outward < DOUBTFUL_OUTWARD and not inside_out)
-    )
-    if not (overlap.covered < LEAST_COVERED or overlap.buried > MOST_BURIED or doubtful):
-        return
+def _check_stray(scan: Scan, skin: Skin, path: Path) -> dict[str, str]:
+    """Refuses a scan with much that is not the person; little of it is a doubt."""
+    stray = find_stray(scan.points, scan.normals, skin)
+    if not stray.count:
+        return {}
+    share, shape = stray.count / len(scan.points), " on a plane" if stray.flat else ""
     problem = (
-        f"scan: expected it over its body, {overlap.covered:.0%} of the body has a scan point within "
-        f"{NEAR:.2f} m and {overlap.buried:.0%} of the scan lies deep inside."
+        f"scan: expected the person alone, {stray.count} of {len(scan.points)} points ({share:.2%}) lie apart from the "
+        f"body{shape}, up to {stray.farthest:.2f} m from it."
     )
-    shift = np.median(body, axis=0) - np.median(scan.points, axis=0)
-    if np.abs(shift).max() > FAR_OFF:
-        hint = f"Their middles differ by {_vector(shift, 1)} m: is the translation in metres?"
+    if stray.flat:
+        hint = "That looks like a floor or wall: cut it off."
+    elif share > 0.05:
+        hint = f"That looks like another person or furniture: keep what lies within {FAR:.1f} m of the body."
     else:
-        hint = suggest_hint(scan.points, scan.normals, body, faces)
+        hint = "Those look like stray points: remove small pieces that are not joined to the person."
+    if share < STRAY and stray.spread < STRAY_SPREAD:
+        return {"stray": f"{problem} {hint}"}
     raise DataError(path, problem, hint)
 
 
-def suggest_hint(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> str:
-    """What would lay a scan over its body: a move, a turn by right angles, a mirror; or that none of them does."""
-    covered, (_, _, skin) = _coverage(points), _face_frames(vertices, faces)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    best, words, corrected = 0.0, "", points
-    for name, linear in _mistakes():
-        moved = skin @ linear  # the inverse of an orthogonal matrix is its transpose: the body goes to the scan
-        if name and (share := covered(moved)) > best:
-            best, words, corrected = share, name, points @ linear.T
-        shift = middle - (moved.min(axis=0) + moved.max(axis=0)) / 2
-        share = covered(moved + shift)
-        if share > best + 0.02:  # a suggestion without a move is the simpler one
-            back = -linear @ shift
-            words = f"{name} and moving it by {_vector(back)} m" if name else f"Moving it by {_vector(back)} m"
-            best, corrected = share, points @ linear.T + back
-    if best < CURED or measure_overlap(corrected, normals, vertices, faces).buried > CURED_BURIED:
-        return "Neither a move, a turn by right angles nor a mirror corrects it: is the fit of another frame or person?"
-    return f"{words} would lay it over the body; or do the reverse to the fit."
+def _check_overlap(
+    samples: ScanSamples, skin: Skin, scan: Scan, body: np.ndarray, template: Template, path: Path
+) -> dict[str, str]:
+    """Refuses a scan that does not lie over its body, with the move, turn or scale that would lay it there."""
+    overlap = samples.overlap(skin)
+    inside_out = overlap.outward < INSIDE_OUT
+    oriented = -1.0 if inside_out else float(overlap.outward >= UNORIENTED)
+    fit, tight = fit_similarity(samples, skin, oriented), tight_weights(template)
+    known = tight is not None
+    misplaced = overlap.covered < LEAST_COVERED or overlap.buried > MOST_BURIED
+    misplaced |= overlap.covered < DOUBTFUL_COVERED and (
+        overlap.buried > DOUBTFUL_BURIED or (overlap.outward < DOUBTFUL_OUTWARD and not inside_out)
+    )
+    reached = f" head, hands and feet lie {100 * fit.before:.1f} cm from it" if known else ""
+    problem = (
+        f"scan: expected it over its body, {overlap.covered:.0%} of the body has a scan point within {NEAR:.2f} m,"
+        f"{reached} and {overlap.buried:.0%} of the scan lies deep inside."
+    )
+    shift = np.median(body, axis=0) - np.median(scan.points, axis=0)
+    if np.abs(shift).max() > FAR_OFF:
+        hint = f"Their middles differ by {show_vector(shift, 1)} m: is the translation in metres?"
+        raise DataError(path, problem, hint)
+    fitted = known and fit.share > MAJORITY
+    if known and fit.share > NEARLY_ALL and (words := _misfit(fit, 1, samples.grain)):
+        raise DataError(path, f"{problem} There {words[0]}", words[1])
+    apart = known and fit.before > APART_TIGHT[0] + samples.grain
+    if misplaced or (apart and (not fitted or _misfit(fit, 0, samples.grain))):
+        hint = suggest_hint(scan.points, scan.normals, body, template.faces.numpy(), tight)
+        if hint or misplaced or fit.before > APART_TIGHT[1] + samples.grain:
+            raise DataError(path, problem, hint or _no_correction(samples, skin, overlap))
+    if fitted and (words := _misfit(fit, 0, samples.grain)):
+        return {"fit": f"{problem} There {words[0]} {words[1]}"}
+    if apart or overlap.covered < DOUBTFUL_COVERED:
+        return {"apart": f"{problem} Is the fit right, and nobody's head, hand or foot missing or covered?"}
+    return {}
 
 
-def _mistakes() -> Iterator[tuple[str, np.ndarray]]:
-    """What may have to be done to a scan, in words and as an orthogonal matrix; the first is nothing."""
-    yield "", np.eye(3)
-    for axis in "xyz":
-        for angle in (-90, 90, 180):
-            turn = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
-            yield f"Turning the scan by {angle} degrees about {axis}", turn
-    for axis, row in zip("xyz", np.eye(3)):
-        yield f"Mirroring the scan ({axis} to -{axis})", np.diag(1 - 2 * row)
-    yield "Swapping y and z of the scan", np.eye(3)[[0, 2, 1]]
+def _misfit(fit: Similarity, level: int, grain: float) -> tuple[str, str] | tuple[()]:
+    """What of a similarity is beyond the limits of a level, 0 doubtful or 1 refused, and the hint; empty if nothing.
+
+    The limits are wider by ``grain``, metres, where scan points lie farther apart (`ScanSamples`).
+    """
+    if abs(fit.scale - 1) > SCALE[level] + grain:
+        hint = f"Divide its positions by {fit.scale:.2f}, or the body has another person's shape (betas) or size."
+        return f"it has {fit.scale:.2f} times the body's size.", hint
+    parts = []
+    if fit.degrees > TURN[level] + np.degrees(grain):
+        parts.append(
+            f"is turned by {fit.degrees:.0f} degrees about {show_vector(fit.turn / np.linalg.norm(fit.turn), 1)}"
+        )
+    if np.linalg.norm(fit.shift) > SHIFT[level] + grain:
+        parts.append(f"lies {show_vector(fit.shift)} m from it")
+    return (f"it {' and '.join(parts)}.", "Undo that to the scan, or do it to the fit.") if parts else ()
 
 
-def _vector(steps: np.ndarray, digits: int = 2) -> str:
-    return f"({', '.join(f'{step:.{digits}f}' for step in steps)})"
+def _no_correction(samples: ScanSamples, skin: Skin, overlap: Overlap) -> str:
+    """The likely cause where no move, turn, mirror or scale lays a scan over its body."""
+    gaps = skin.tree.query(samples.points)[0]
+    if overlap.buried <= MOST_BURIED and np.quantile(gaps, 0.9) < NEAR and overlap.covered < DOUBTFUL_COVERED:
+        return "What there is of the scan lies on the body: is part of the person missing from it?"
+    return (
+        "Neither a move, a turn by right angles, a mirror nor a scale corrects it: is the fit of another frame or "
+        "person?"
+    )
 
 
-def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> None:
+def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> dict[str, str]:
     """Refuses normals that point inward, or either way, and faces that are wound against them."""
+    doubts = {}
     if overlap.outward < INSIDE_OUT:
         problem = f"scan normals: expected them to point outward, {1 - overlap.outward:.0%} point into the body."
         raise DataError(path, problem, "The scan is inside out: multiply its normals by -1.")
-    if overlap.outward < UNORIENTED:
+    if overlap.outward < DOUBTFUL_OUTWARD:
         problem = f"scan normals: expected them to point outward, only {overlap.outward:.0%} do."
-        raise DataError(path, problem, "Orient them (MeshLab, Open3D), or compute them from the mesh.")
-    if scan.faces is None or not len(scan.faces):
-        return
-    some = scan.faces[:: max(1, len(scan.faces) // 1000)]
+        hint = "Orient them (MeshLab, Open3D), or compute them from the mesh."
+        if overlap.outward < UNORIENTED:
+            raise DataError(path, problem, hint)
+        doubts["normals"] = f"{problem} {hint}"
+    if scan.faces is None:
+        return doubts
+    some = scan.faces[thin(len(scan.faces), 1000)]
     a, b, c = (scan.points[some[:, corner]] for corner in range(3))
-    agree = float(((np.cross(b - a, c - a) * scan.normals[some[:, 0]]).sum(axis=1) > 0).mean())
-    if agree < 0.5:
+    agree = float(((np.cross(b - a, c - a) * scan.normals[some].sum(axis=1)).sum(axis=1) > 0).mean())
+    if agree < DOUBTFUL_WOUND:
         problem = f"scan faces: expected them counter-clockwise from outside, {1 - agree:.0%} are not."
-        raise DataError(path, problem, "Swap two columns of the faces.")
+        hint = "Are they this scan's, all wound one way?"
+        if agree < INSIDE_OUT:
+            hint = (
+                "Either the scan is mirrored (compare left and right with a picture; negate one coordinate of points "
+                "and normals), or its faces are wound inward (swap two of their columns)."
+            )
+        if agree < WOUND:
+            raise DataError(path, problem, hint)
+        doubts["faces"] = f"{problem} {hint}"
+    return doubts
 
 
 def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Template, path: Path) -> None:
@@ -301,7 +327,7 @@ def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Te
     turn, _ = Rotation.align_vectors(vertices - middle, posed - other)
     turned = turn.apply(posed - other) + middle
     if distance(posed + middle - other) <= APART:
-        hint = f"A move of {_vector(middle - other)} m would: is the translation right?"
+        hint = f"A move of {show_vector(middle - other)} m would: is the translation right?"
     elif distance(turned) <= APART:
         degrees = np.degrees(turn.magnitude())
         hint = f"Turning the whole body by {degrees:.0f} degrees would: is the root's rotation in both?"

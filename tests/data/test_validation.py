@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError
+from avatar.data.alignment import measure_overlap, suggest_hint
 from avatar.data.layouts import find_outfit
 from avatar.data.scanner import SCANNERS
 from avatar.data.validation import (
@@ -18,8 +19,6 @@ from avatar.data.validation import (
     check_frame_count,
     check_pose,
     check_template,
-    measure_overlap,
-    suggest_hint,
 )
 from avatar.geometry.surface import vertex_normals
 from avatar.records import BodyFit, Frame, Scan
@@ -180,7 +179,7 @@ def spoil_normals(scan, how):
     [
         ("inside out", r"\d\d\d?% point into the body.*multiply its normals by -1"),
         ("either way", r"only \d\d% do.*Orient them"),
-        ("wound the other way", "counter-clockwise from outside.*Swap two columns"),
+        ("wound the other way", "counter-clockwise from outside.*scan is mirrored.*wound inward .swap two"),
     ],
 )
 def test_normals_and_faces_that_point_the_wrong_way_are_refused(how, message, tmp_path):
