@@ -63,24 +63,29 @@ def sample_skin(vertices: np.ndarray, faces: np.ndarray, tight: np.ndarray | Non
 
     ``tight (V,)`` are weights in [0, 1] of `tight_weights`, or None.
     """
-    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
-    crosses = np.cross(b - a, c - a)
-    areas = np.sqrt(np.einsum("fi,fi->f", crosses, crosses)).cumsum()
-    picked = np.searchsorted(areas, (np.arange(SKIN_SAMPLES) + 0.5) / SKIN_SAMPLES * areas[-1]).clip(max=len(faces) - 1)
-    crosses = crosses[picked]
-    close = np.ones(SKIN_SAMPLES, bool) if tight is None else tight[faces[picked]].mean(axis=1) > TIGHT
+    areas = np.linalg.norm(_crosses(vertices, faces), axis=1).cumsum(dtype=np.float64)
+    picked = np.searchsorted(areas, (np.arange(SKIN_SAMPLES) + 0.5) / SKIN_SAMPLES * areas[-1])
+    faces = faces[picked.clip(max=len(faces) - 1)]
+    corners = vertices[faces].astype(np.float64)
+    crosses = _crosses(corners.reshape(-1, 3), np.arange(3 * SKIN_SAMPLES).reshape(-1, 3))
+    close = np.ones(SKIN_SAMPLES, bool) if tight is None else tight[faces].mean(axis=1) > TIGHT
     lengths = np.linalg.norm(crosses, axis=1, keepdims=True)
-    return Skin((a[picked] + b[picked] + c[picked]) / 3, crosses / np.maximum(lengths, 1e-20), close)
+    return Skin(corners.mean(axis=1), crosses / np.maximum(lengths, 1e-20), close)
+
+
+def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Cross products ``(F, 3)`` of two edges of each face."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
 
 
 def tight_weights(template: Template) -> np.ndarray | None:
     """The share ``(V,)`` of skinning weights of head, hands and feet; None where the joints have other names."""
-    names, chosen = template.joint_names, []
+    names = template.joint_names
+    chosen = np.zeros(len(names), np.float32)
     for joint, parent in enumerate(template.parents):
-        if names[joint] in TIGHT_ROOTS or parent in chosen:
-            chosen.append(joint)
-    roots = set(TIGHT_ROOTS) <= set(names)
-    return template.weights[:, chosen].sum(dim=1).numpy() if roots else None
+        chosen[joint] = names[joint] in TIGHT_ROOTS or (parent >= 0 and chosen[parent])
+    return template.weights.numpy() @ chosen if set(TIGHT_ROOTS) <= set(names) else None
 
 
 def thin(count: int, most: int) -> np.ndarray:
@@ -149,28 +154,28 @@ def find_stray(points: np.ndarray, normals: np.ndarray, skin: Skin) -> Stray:
     Points are counted in cubes of 5 cm (larger in sparse scans), so distances are right to about that size.
     """
     low, high = skin.places.min(axis=0) - FAR, skin.places.max(axis=0) + FAR
-    inside = ((points >= low) & (points <= high)).all(axis=1)
     cell = max(CELL, 3 * float(np.sqrt(2 / len(points))))
-    shape = np.ceil((high - low) / cell).astype(np.int64) + 1
-    cells = np.ravel_multi_index(((points[inside] - low) / cell).astype(np.int64).T, shape)
-    counts = np.bincount(cells, minlength=int(shape.prod()))
+    shape = np.ceil((high - low) / cell).astype(np.int64)
+    cells, inside = np.zeros(len(points), np.int64), np.ones(len(points), bool)
+    for axis, size in enumerate(shape):
+        steps = (points[:, axis] - low[axis]) / cell
+        inside &= (steps >= 0) & (steps < size)
+        cells = cells * size + np.clip(steps, 0, size - 1).astype(np.int64)
+    counts = np.bincount(cells[inside], minlength=int(shape.prod()))
     places = np.flatnonzero(counts)
     centres = low + (np.stack(np.unravel_index(places, shape), axis=1) + 0.5) * cell
     gaps, _ = skin.tree.query(centres)
-    pieces = label(counts.reshape(shape) > 0, np.ones((3, 3, 3), bool))[0].reshape(-1)[places]
-    near = np.zeros(pieces.max(initial=0) + 1, bool)
-    near[pieces[gaps < max(JOINED, cell)]] = True
-    stray = (gaps > FAR) | ~near[pieces]
-    beside = gaps > max(JOINED, cell)
-    flags = np.zeros(counts.size, np.uint8)
-    flags[places] = stray + 2 * (beside & ~stray)
-    kind = flags[cells]
-    flat = False
-    loose = np.flatnonzero(inside)[kind > 0]
-    if len(loose) > len(points) / 100:
-        flat = is_flat(points[loose], normals[loose])
-        if flat:
+    beside, stray = gaps > max(JOINED, cell), gaps > FAR
+    if beside.any():
+        pieces = label(counts.reshape(shape) > 0, np.ones((3, 3, 3), bool))[0].reshape(-1)[places]
+        stray |= ~np.isin(pieces, np.unique(pieces[~beside]))
+        flags = np.zeros(counts.size, bool)
+        flags[places[beside]] = True
+        loose = np.flatnonzero(inside & flags[cells])
+        if flat := len(loose) > len(points) / 100 and is_flat(points[loose], normals[loose]):
             stray |= beside
+    else:
+        flat = False
     outside = points[~inside]
     away = skin.tree.query(outside[thin(len(outside), SCAN_SAMPLES)])[0]
     square = (counts[places[stray]] * gaps[stray] ** 2).sum() + (away**2).sum() * len(outside) / max(len(away), 1)

@@ -158,7 +158,7 @@ def check_frame(frame: Frame, template: Template, path: Path) -> dict[str, str]:
         problem = f"scan: expected at least {FEWEST_POINTS} points, got {len(scan.points)}."
         raise DataError(path, problem, "Leave the frame out or scan it again.")
     check_size(body, template, path)
-    lengths = np.linalg.norm(scan.normals, axis=1)
+    lengths = np.sqrt(np.einsum("mi,mi->m", scan.normals, scan.normals))
     if lengths.min() < 0.5 or (np.abs(lengths - 1) > 0.05).mean() > 0.01:
         problem = f"scan normals: expected unit length, got {lengths.min():.3g} to {lengths.max():.3g}."
         raise DataError(path, problem, "Normalise them, or compute them anew.")
@@ -166,9 +166,10 @@ def check_frame(frame: Frame, template: Template, path: Path) -> dict[str, str]:
     samples, skin = ScanSamples(scan.points, scan.normals), sample_skin(body, faces, tight)
     ends = np.quantile(samples.points, [0.02, 0.98], axis=0)  # whatever a few stray points say
     _check_ratio("scan", ends, body, "the body", path)
-    doubts = _check_overlap(samples, skin, scan, body, template, path)
+    overlap = samples.overlap(skin)
+    doubts = _check_overlap(overlap, samples, skin, frame, faces, tight, path)
     doubts |= _check_stray(scan, skin, path)
-    return doubts | _check_normals(samples.overlap(skin), scan, path)
+    return doubts | _check_normals(overlap, scan, path)
 
 
 def check_size(body: np.ndarray, template: Template, path: Path) -> None:
@@ -216,14 +217,19 @@ def _check_stray(scan: Scan, skin: Skin, path: Path) -> dict[str, str]:
 
 
 def _check_overlap(
-    samples: ScanSamples, skin: Skin, scan: Scan, body: np.ndarray, template: Template, path: Path
+    overlap: Overlap,
+    samples: ScanSamples,
+    skin: Skin,
+    frame: Frame,
+    faces: np.ndarray,
+    tight: np.ndarray | None,
+    path: Path,
 ) -> dict[str, str]:
     """Refuses a scan that does not lie over its body, with the move, turn or scale that would lay it there."""
-    overlap = samples.overlap(skin)
+    scan, body, known = frame.scan, frame.body.vertices, tight is not None
     inside_out = overlap.outward < INSIDE_OUT
     oriented = -1.0 if inside_out else float(overlap.outward >= UNORIENTED)
-    fit, tight = fit_similarity(samples, skin, oriented), tight_weights(template)
-    known = tight is not None
+    fit = fit_similarity(samples, skin, oriented)
     misplaced = overlap.covered < LEAST_COVERED or overlap.buried > MOST_BURIED
     misplaced |= overlap.covered < DOUBTFUL_COVERED and (
         overlap.buried > DOUBTFUL_BURIED or (overlap.outward < DOUBTFUL_OUTWARD and not inside_out)
@@ -242,7 +248,7 @@ def _check_overlap(
         raise DataError(path, f"{problem} There {words[0]}", words[1])
     apart = known and fit.before > APART_TIGHT[0] + samples.grain
     if misplaced or (apart and (not fitted or _misfit(fit, 0, samples.grain))):
-        hint = suggest_hint(scan.points, scan.normals, body, template.faces.numpy(), tight)
+        hint = suggest_hint(scan.points, scan.normals, body, faces, tight)
         if hint or misplaced or fit.before > APART_TIGHT[1] + samples.grain:
             raise DataError(path, problem, hint or _no_correction(samples, skin, overlap))
     if fitted and (words := _misfit(fit, 0, samples.grain)):
