@@ -27,11 +27,13 @@ from avatar.data.alignment import (
     thin,
     tight_weights,
 )
+from avatar.geometry.units import METRES, USUAL, possible_units
 from avatar.records import Frame, Scan, Template
 
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
-UNITS = {"centimetres": 100, "millimetres": 1000}  # in a metre
+UNITS = {"cm": "centimetres", "mm": "millimetres", "in": "inches"}
+LIKE = 1.5  # times larger or smaller than a unit would make it, and still taken for it
 FEWEST_POINTS = 100
 FAR_OFF = 10.0  # metres between the middles of scan and body that only a translation in other units explains
 # Valid frames (sample, dress, skirt, jacket; perfect and raw scans, all poses) cover 92% and more of the
@@ -75,7 +77,8 @@ def check_template(template: Template, path: Path) -> None:
         _check_axes(template, path)
     if not low <= extents[1] <= high:
         problem = f"vertices: expected a body {low} to {high} m high, got {extents[1]:.4g} along y."
-        raise DataError(path, problem, _unit_hint(float(extents[1])))
+        height = float(extents[1])
+        raise DataError(path, problem, _unit_hint(possible_units(height), height / USUAL))
 
 
 def _check_axes(template: Template, path: Path) -> None:
@@ -135,9 +138,9 @@ def check_joints(template: Template, path: Path) -> None:
 
 def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: Callable[[np.ndarray], bool]) -> str:
     """What would lay joints ``(J, 3)`` on the borders of their weights ``(J, 3)``, so that they ``fit``."""
-    for unit, factor in UNITS.items():
-        if fit(joints / factor):
-            return f"They look like {unit}: divide joints by {factor}."
+    for unit, name in UNITS.items():
+        if fit(joints * METRES[unit]):
+            return f"They look like {name}: divide joints by {1 / METRES[unit]:.5g}."
     other = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in names]
     if set(other) == set(names) and fit(joints[[names.index(name) for name in other]]):
         return "The weights of left and right look swapped: exchange their columns, or the joints' names."
@@ -183,14 +186,21 @@ def _check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, pa
     low, high = SIZE_RATIO
     if not low <= size / expected <= high:
         problem = f"{what}: expected about {expected:.2f} m across as {words}, got {size:.4g}."
-        raise DataError(path, problem, _unit_hint(size))
+        ratio = size / expected
+        near = [unit for unit in UNITS if 1 / LIKE < ratio * METRES[unit] < LIKE]
+        raise DataError(path, problem, _unit_hint(near, ratio))
 
 
-def _unit_hint(size: float) -> str:
-    for unit, factor in UNITS.items():
-        if BODY_HEIGHT[0] <= size / factor <= 2 * BODY_HEIGHT[1]:
-            return f"That looks like {unit}: divide positions and translations by {factor} (multiply by {1 / factor})."
-    if BODY_HEIGHT[0] <= size * 1000 <= 2 * BODY_HEIGHT[1]:
+def _unit_hint(units: Sequence[str], ratio: float) -> str:
+    """What to do with positions in one of ``units``, ``ratio`` times as large as in metres."""
+    factors = {unit: 1 / METRES[unit] for unit in units}
+    if factors:
+        looks = " or ".join(UNITS[unit] for unit in factors)
+        factor = next(iter(factors.values()))
+        return (
+            f"That looks like {looks}: divide positions and translations by {factor:.5g} (multiply by {1 / factor:g})."
+        )
+    if 1 / LIKE < ratio * 1000 < LIKE:
         return "That looks like kilometres, or metres scaled twice: multiply positions and translations by 1000."
     return "Positions must be in metres with y up, and a scan must hold nothing but the person."
 

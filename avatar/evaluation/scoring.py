@@ -147,36 +147,58 @@ def measure_floors(
     outfit: Outfit, split: str, config: ScoreConfig, points: int, commit: str = "", ledger: Ledger | None = None
 ) -> Scores:
     """Scores floors as if they were predictions of so many ``points``, each frame for itself. ``sampling`` is a second
-    sampling of the true surface: what a perfect surface scores. Outfits without ``resample`` have their scan points
-    split into halves instead, variant ``halves``: with fewer points that floor is too high. ``body`` are points spread
-    area-uniformly over the posed bare body.
+    sampling of the true surface: what a perfect surface scores. Outfits without ``resample`` are sampled from their
+    scans' meshes (variant ``mesh``), or by scan points beyond those that are scored against (variant ``rest``); without
+    either there is no sampling floor, and a warning says so. ``body`` are points spread area-uniformly over the posed
+    bare body.
     """
     resample, config = getattr(outfit, "resample", None), replace(config, motion=False)
+    names = frame_names(outfit, split)
+    source = "" if resample else scan_source(outfit, split, names, config, points)
 
     def sampling(frame: Frame) -> Comparison:
-        scan = draw_scan(frame, config)
-        if resample is None:
-            order = frame_generator(frame.name, config.seed + 1).permutation(len(scan.points))
-            halves = map(np.sort, np.array_split(order, 2))
-            again, scan = (Scan(scan.points[half], scan.normals[half]) for half in halves)
+        scan, seed = draw_scan(frame, config), config.seed + 1
+        if source == "mesh":
+            again = sample_body(Mesh(frame.scan.points, frame.scan.faces), points, seed)
+        elif source == "rest":
+            rest = draw_order(frame, config)[config.scan_points :][:points]
+            again = PointCloud(frame.scan.points[rest], frame.scan.normals[rest])
         else:
-            again = resample(split, frame.name, points, seed=config.seed + 1)
+            sampled = resample(split, frame.name, points, seed=seed)
+            again = PointCloud(sampled.points, sampled.normals)
             if (again.points[:10, None] == frame.scan.points).all(axis=2).any(axis=1).all():
                 raise AvatarError("resample: expected another sampling of the surface, got the scan's own points.")
-        return Comparison(PointCloud(again.points, again.normals), scan, posed_body(outfit, frame))
+        return Comparison(again, scan, posed_body(outfit, frame))
 
     def bare(frame: Frame) -> Comparison:
         body = posed_body(outfit, frame)
         return Comparison(sample_body(body, points, config.seed), draw_scan(frame, config), body)
 
-    if resample is None:
-        log.warning("%s: no true surface to sample again, so the sampling floor compares scan halves.", outfit.name)
+    floors = {"sampling": sampling} if source is not None else {}
     contenders = []
-    for floor, compare, variant in (("sampling", sampling, "" if resample else "halves"), ("body", bare, "")):
+    for floor, compare in (floors | {"body": bare}).items():
+        label = Label(floor, variant=source if floor == "sampling" else "", commit=commit, split=split)
         memory = remember_points(ledger, floor, outfit, split, config, points=points)
-        contenders.append(Contender(Label(floor, variant=variant, commit=commit, split=split), compare, memory))
+        contenders.append(Contender(label, compare, memory))
     metrics = [metric for metric in find_metrics(config.metrics) if not metric.needs_mesh]
-    return score_frames(outfit, split, frame_names(outfit, split), metrics, contenders)
+    return score_frames(outfit, split, names, metrics, contenders)
+
+
+def scan_source(outfit: Outfit, split: str, names: Sequence[str], config: ScoreConfig, points: int) -> str | None:
+    """What samples the surface of all frames again where only scans are known: ``mesh``, ``rest`` or None for nothing.
+
+    A floor is compared with methods, so it needs as many ``points`` as they predict, and none of those scored against.
+    """
+    wanted, source = config.scan_points + points, "mesh"
+    for name in names:
+        scan = outfit.load(split, name).scan
+        source = source if scan.faces is not None else "rest"
+        if source == "rest" and (count := len(scan.points)) < wanted:
+            problem = f"no sampling floor: without a mesh it needs scans of {wanted} points, {name} has {count}"
+            hint = "score.scan_points and points may be lowered, or scan_faces added"
+            log.warning("%s: %s (%s).", outfit.name, problem, hint)
+            return None
+    return source
 
 
 def remember_points(
@@ -203,11 +225,15 @@ def sample_body(body: Mesh, points: int, seed: int) -> PointCloud:
 
 def draw_scan(frame: Frame, config: ScoreConfig) -> Scan:
     """The scan points a frame is scored against: a random subset, the same for every method."""
-    count = len(frame.scan.points)
-    if count <= config.scan_points:
+    if len(frame.scan.points) <= config.scan_points:
         return frame.scan
-    chosen = np.sort(frame_generator(frame.name, config.seed).permutation(count)[: config.scan_points])
+    chosen = np.sort(draw_order(frame, config)[: config.scan_points])
     return Scan(frame.scan.points[chosen], frame.scan.normals[chosen])
+
+
+def draw_order(frame: Frame, config: ScoreConfig) -> np.ndarray:
+    """The random order ``(M,)`` of a frame's scan points, of which the first ``config.scan_points`` are compared."""
+    return frame_generator(frame.name, config.seed).permutation(len(frame.scan.points))
 
 
 def frame_generator(name: str, seed: int) -> np.random.Generator:

@@ -1,9 +1,11 @@
 """The sampling and body floors on spheres."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from avatar.checks import AvatarError
 from avatar.evaluation.scoring import ScoreConfig, measure_floors, sample_body
@@ -36,13 +38,35 @@ def test_sampling_floor_is_the_spacing_of_random_points(ball):
     assert "jitter" not in values(scores)  # its points are drawn anew each frame
 
 
-def test_sampling_floor_from_halves_is_marked(ball_without_truth, caplog):
-    with caplog.at_level(logging.WARNING):
-        scores = measure_floors(ball_without_truth, "test", CONFIG, 3000).only("method", ["sampling"])
-    assert {row.variant for row in scores.rows} == {"halves"}
-    assert {row.points for row in scores.rows} == {1500}
+def test_scans_alone_have_a_floor_where_they_have_points_to_spare(ball_without_truth, caplog):
+    """It is that of the true surface at the same counts, and no method that has the surface lies below it."""
+    config = replace(CONFIG, scan_points=1500)
+    scores = measure_floors(ball_without_truth, "test", config, 1500).only("method", ["sampling"])
+    assert {(row.variant, row.points) for row in scores.rows} == {("rest", 1500)}
     assert values(scores)["cd_point"] == pytest.approx(2 * 4 / 1500, rel=0.1)
-    assert "halves" in caplog.text
+    assert caplog.text == ""
+    with caplog.at_level(logging.WARNING):
+        scores = measure_floors(ball_without_truth, "test", config, 1501)
+    assert {row.method for row in scores.rows} == {"body"}
+    assert "no sampling floor: without a mesh it needs scans of 3001 points, reach.0007 has 3000" in caplog.text
+
+
+def test_scans_that_are_meshes_are_sampled_again(ball_without_truth):
+    load = ball_without_truth.load
+
+    def meshed(split, name):
+        frame = load(split, name)
+        faces = ConvexHull(frame.scan.points).simplices
+        corners = frame.scan.points[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        inward = (normals * corners[:, 0]).sum(axis=1) < 0
+        faces[inward] = faces[inward][:, ::-1]
+        return replace(frame, scan=replace(frame.scan, faces=faces.astype(np.int64)))
+
+    ball_without_truth.load = meshed
+    scores = measure_floors(ball_without_truth, "test", CONFIG, 6000).only("method", ["sampling"])
+    assert {(row.variant, row.points) for row in scores.rows} == {("mesh", 6000)}
+    assert values(scores)["cd_point"] == pytest.approx(4 / 6000 + 4 / 3000, rel=0.1)
 
 
 def test_a_sampling_that_is_not_independent_is_refused(ball):
