@@ -73,6 +73,16 @@ def read_arrays(
         raise DataError(path, f"expected a valid npz file, reading failed: {error}.", hint) from error
 
 
+def member_checksums(path: Path) -> dict[str, tuple[int, int]]:
+    """CRC-32 and bytes of an npz file's arrays by key, from its directory alone; nothing of a file that has none."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            infos = archive.infolist()[:MEMBER_LIMIT]
+            return {info.filename.removesuffix(".npy"): (info.CRC, info.file_size) for info in infos}
+    except DAMAGED:
+        return {}
+
+
 def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipfile.ZipInfo]:
     """Array members by key, after the checks that need no reading."""
     infos = archive.infolist()
