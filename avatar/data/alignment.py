@@ -95,11 +95,14 @@ def thin(count: int, most: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Shares: of skin with a scan point near, of scan deep under the skin, of scan normals that point as it does."""
+    """Shares: of skin with a scan point near, of scan deep under the skin, of scan normals that point as it does; and
+    the mean cosine between these and the skin's normals.
+    """
 
     covered: float
     buried: float
     outward: float
+    cosine: float
 
 
 class ScanSamples:
@@ -129,10 +132,12 @@ class ScanSamples:
         _, below = skin.tree.query(self.points[some])
         outward = skin.normals[below]
         heights = ((self.points[some] - skin.places[below]) * outward).sum(axis=1)
+        cosines = (self.normals[some] * outward).sum(axis=1)
         return Overlap(
             covered=self.coverage(skin.covered),
             buried=float((heights < -DEEP).mean()),
-            outward=float(((self.normals[some] * outward).sum(axis=1) > 0).mean()),
+            outward=float((cosines > 0).mean()),
+            cosine=float(cosines.mean()),
         )
 
 
@@ -201,7 +206,8 @@ class Similarity:
 
     ``turn`` is a rotation vector, radians; ``shift (3,)`` moves the middle of head, hands and feet, metres; ``before``
     and ``after`` are their mean distances to the scan as it is and with the similarity undone, metres; ``share`` is
-    that of their places which come to lie on the scan.
+    that of their places which come to lie on the scan, ``roughness`` the median distance of the scan from an even layer
+    over them, metres.
     """
 
     scale: float
@@ -210,6 +216,7 @@ class Similarity:
     before: float
     after: float
     share: float
+    roughness: float
 
     @property
     def degrees(self) -> float:
@@ -229,7 +236,7 @@ def fit_similarity(
     middle = places.mean(axis=0)
     linear = np.eye(3) if start is None else start
     shift, first = np.zeros(3) if shift is None else shift, linear
-    body = places - middle
+    body, roughness = places - middle, 0.0
     for _ in range(ROUNDS):
         moved = body @ linear.T + shift
         facing = normals @ (linear / np.cbrt(abs(np.linalg.det(linear)))).T
@@ -244,6 +251,7 @@ def fit_similarity(
         ones = np.ones((len(moved), 1))
         system = np.concatenate([(moved * facing).sum(axis=1)[:, None], np.cross(moved, facing), facing, ones], axis=1)
         step = np.linalg.lstsq(system[kept], heights[kept], rcond=None)[0]
+        roughness = float(np.median(np.abs(heights - system @ step)[kept]))
         turn = (1 + step[0]) * Rotation.from_rotvec(step[1:4]).as_matrix()
         linear, shift = turn @ linear, turn @ shift + step[4:7]
         if not 0.1 < abs(np.linalg.det(linear)) < 10:
@@ -255,7 +263,7 @@ def fit_similarity(
     turned = Rotation.from_matrix(turn / np.cbrt(np.linalg.det(turn)))
     gaps = scan.tree.query(body @ linear.T + shift + middle, distance_upper_bound=TIGHT_CLIP)[0]
     after, share = float(np.minimum(gaps, TIGHT_CLIP).mean()), float((gaps < scan.inlier).mean())
-    return Similarity(scale, turned.as_rotvec(), shift, scan.distance(places), after, share)
+    return Similarity(scale, turned.as_rotvec(), shift, scan.distance(places), after, share, roughness)
 
 
 def measure_overlap(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Overlap:

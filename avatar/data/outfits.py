@@ -83,10 +83,14 @@ class Outfit(ABC):
         path = self.frame_path(split, name)
         frame = self._read_frame(path, split, name)
         for kind, doubt in check_frame(frame, self.template, path).items():
-            if kind not in self._doubted:
-                self._doubted.add(kind)
-                log.warning("%s: %s (Others like it are not mentioned.)", path, doubt)
+            self._doubt(kind, path, doubt)
         return frame
+
+    def _doubt(self, kind: str, path: Path, doubt: str) -> None:
+        """Logs what is doubtful about a file, the first time for its kind."""
+        if kind not in self._doubted:
+            self._doubted.add(kind)
+            log.warning("%s: %s (Others like it are not mentioned.)", path, doubt)
 
     def load_body(self, split: str, name: str) -> BodyFit:
         """The body under a frame; errors as in `load`."""

@@ -18,6 +18,7 @@ from avatar.body.packed import write_body, write_template
 from avatar.body.registry import body_of_file, canonical_name
 from avatar.body.skinning import blend_transforms, skin_transforms
 from avatar.checks import DataError, check_shape, require
+from avatar.data.alignment import thin
 from avatar.data.folders import OUTFIT_FORMAT, SPLITS, read_outfit_settings
 from avatar.data.outfits import Outfit
 from avatar.data.validation import check_pose, check_posed, check_size, check_vertex_transforms
@@ -31,6 +32,7 @@ from avatar.records import BodyFit, Frame, Scan, Template
 
 log = logging.getLogger(__name__)
 
+ROUNDING = (5e-4, 2e-3)  # metres: doubtful, and refused
 BODY, MEAN = "body", "mean_body"  # keys of outfit.yaml
 BODY_FILES = {BODY: "template.npz", MEAN: "mean.npz"}  # where a body is that outfit.yaml gives no path
 
@@ -114,10 +116,27 @@ class PackedOutfit(Outfit):
             if key in stored and len(stored[key]) != expected:
                 problem = f"{key}: expected {expected} rows as in the template, got {len(stored[key])}."
                 raise DataError(path, problem, "The frame belongs to another body than the template.")
+        self._check_rounding(stored, path)
         if "pose" in stored:
             stored["pose"] = _stored_pose(stored["pose"], self.template.joint_names, path)
         stored = {k: v.astype(np.float32) if v.dtype.kind == "f" else v for k, v in stored.items()}
         return Frame(name, self.name, split, self._fit(stored, path), _stored_scan(stored, path))
+
+    def _check_rounding(self, stored: dict[str, np.ndarray], path: Path) -> None:
+        """Refuses positions so far from the origin that their type, or float32, rounds them much; some is doubtful."""
+        for key in ("scan_pc", "body_verts"):
+            if key not in stored or not stored[key].size:
+                continue
+            middle = float(np.abs(np.median(stored[key][thin(len(stored[key]), 1000)], axis=0)).max())
+            kind = np.float16 if stored[key].dtype.itemsize == 2 else np.float32
+            step = float(np.spacing(kind(middle)))
+            if step > ROUNDING[0]:
+                near = f"{key}: expected positions near the origin"
+                problem = f"{near}, {kind.__name__} rounds those at {middle:.4g} m to {step:.2g} m."
+                hint = "Move body, scan and translation to the origin; store float32."
+                if not step <= ROUNDING[1]:
+                    raise DataError(path, problem, hint)
+                self._doubt(f"{key} rounding", path, f"{problem} {hint}")
 
     def _fit(self, stored: dict[str, np.ndarray], path: Path) -> BodyFit:
         """The body of a frame, with what the file lacks derived from what it has, and the rest of it compared."""
@@ -186,7 +205,7 @@ def _stored_scan(stored: dict[str, np.ndarray], path: Path) -> Scan:
     faces, colors = scan.faces, scan.colors
     if faces is not None and faces.size and (faces.min() < 0 or faces.max() >= len(scan.points)):
         raise DataError(path, f"scan_faces: expected indices in [0, {len(scan.points)}), got others.")
-    faces = None if faces is None else faces.astype(np.int64)
+    faces = faces.astype(np.int64) if faces is not None and len(faces) else None
     colors = None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu")
     return replace(scan, normals=normals, faces=faces, colors=colors)
 

@@ -37,15 +37,17 @@ LIKE = 1.5  # times larger or smaller than a unit would make it, and still taken
 FEWEST_POINTS = 100
 FAR_OFF = 10.0  # metres between the middles of scan and body that only a translation in other units explains
 # Valid frames (sample, dress, skirt, jacket; perfect and raw scans, all poses) cover 92% and more of the
-# body, bury 0.2% at most, and 93% of their normals point outward.
-LEAST_COVERED, MOST_BURIED = 0.6, 0.05  # each alone is a misfit
+# body, bury 0.2% at most, 93% of their normals point outward, with a mean cosine of 0.71 to the skin's.
+LEAST_COVERED, MOST_BURIED = 0.7, 0.05  # each alone is a misfit
 DOUBTFUL_COVERED, DOUBTFUL_BURIED, DOUBTFUL_OUTWARD = 0.85, 0.01, 0.8  # the first with one of the others
+ACROSS = 0.5  # mean cosine between normals of scan and skin; 0.4 for normals turned by 90 degrees
 WOUND, DOUBTFUL_WOUND = 0.7, 0.9  # shares of faces wound as their normals say; 0.99 in raw meshes
 # At head, hands and feet valid scans lie within 1.4 cm on average (2.1 cm with hair and shoes added), and have 0.1%
 # (2.7%) of another size, 0.3 (0.8) degrees of turn and 0.2 cm (0.8 cm) of shift. The first is a doubt, the second
 # refused.
 SCALE, TURN, SHIFT = (0.04, 0.08), (4.0, 10.0), (0.03, 0.06)  # share, degrees, metres
 APART_TIGHT = (0.025, 0.10)  # metres of mean distance
+ROUGH = 0.005  # metres that the scan lies off an even layer there: 1.6 mm, and 4 mm and more with 1 cm of noise
 MAJORITY, NEARLY_ALL = 0.5, 0.8  # shares of the places there on the scan: a gown may hide the feet
 STRAY, STRAY_SPREAD = 2e-3, 2e-5  # share of points, or square metres that they add to a Chamfer distance: refused
 ALONG = 0.7  # cosine to an axis from which on a direction runs along it
@@ -167,11 +169,14 @@ def check_frame(frame: Frame, template: Template, path: Path) -> dict[str, str]:
         raise DataError(path, problem, "Normalise them, or compute them anew.")
     tight = tight_weights(template)
     samples, skin = ScanSamples(scan.points, scan.normals), sample_skin(body, faces, tight)
-    ends = np.quantile(samples.points, [0.02, 0.98], axis=0)  # whatever a few stray points say
-    _check_ratio("scan", ends, body, "the body", path)
     overlap = samples.overlap(skin)
-    doubts = _check_overlap(overlap, samples, skin, frame, faces, tight, path)
-    doubts |= _check_stray(scan, skin, path)
+    there = overlap.covered >= DOUBTFUL_COVERED  # the person; what else there is says nothing of units and fit
+    doubts = _check_stray(scan, skin, path) if there else {}
+    if not there:
+        ends = np.quantile(samples.points, [0.02, 0.98], axis=0)  # whatever a few stray points say
+        _check_ratio("scan", ends, body, "the body", path)
+    doubts |= _check_overlap(overlap, samples, skin, frame, faces, tight, path)
+    doubts |= {} if there else _check_stray(scan, skin, path)
     return doubts | _check_normals(overlap, scan, path)
 
 
@@ -213,7 +218,7 @@ def _check_stray(scan: Scan, skin: Skin, path: Path) -> dict[str, str]:
     share, shape = stray.count / len(scan.points), " on a plane" if stray.flat else ""
     problem = (
         f"scan: expected the person alone, {stray.count} of {len(scan.points)} points ({share:.2%}) lie apart from the "
-        f"body{shape}, up to {stray.farthest:.2f} m from it."
+        f"body{shape}, up to {stray.farthest:.3g} m from it."
     )
     if stray.flat:
         hint = "That looks like a floor or wall: cut it off."
@@ -265,6 +270,9 @@ def _check_overlap(
         return {"fit": f"{problem} There {words[0]} {words[1]}"}
     if apart or overlap.covered < DOUBTFUL_COVERED:
         return {"apart": f"{problem} Is the fit right, and nobody's head, hand or foot missing or covered?"}
+    if fitted and fit.roughness > ROUGH + samples.grain:
+        scatter = f"it lies {1000 * fit.roughness:.1f} mm (median) off an even layer over head, hands and feet"
+        return {"rough": f"scan: expected a surface, {scatter}. That is noise, or a poor fit."}
     return {}
 
 
@@ -303,6 +311,10 @@ def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> dict[str, str]:
     if overlap.outward < INSIDE_OUT:
         problem = f"scan normals: expected them to point outward, {1 - overlap.outward:.0%} point into the body."
         raise DataError(path, problem, "The scan is inside out: multiply its normals by -1.")
+    if overlap.outward >= UNORIENTED and overlap.cosine < ACROSS:
+        found = f"their mean cosine to the body's is {overlap.cosine:.2f}"
+        problem = f"scan normals: expected them to stand on the surface, {found}."
+        raise DataError(path, problem, "Were points and normals turned alike? Else compute them anew.")
     if overlap.outward < DOUBTFUL_OUTWARD:
         problem = f"scan normals: expected them to point outward, only {overlap.outward:.0%} do."
         hint = "Orient them (MeshLab, Open3D), or compute them from the mesh."

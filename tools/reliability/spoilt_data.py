@@ -255,6 +255,12 @@ def whole(linear: np.ndarray) -> Callable:
     return spoil
 
 
+def away(frame: Arrays, distance: float, kind: type) -> Arrays:
+    """Scan and body far from the origin, of a type."""
+    arrays = {key: (frame[key].astype(np.float64) + distance).astype(kind) for key in ("scan_pc", "body_verts")}
+    return {key: value for key, value in (frame | arrays).items() if key not in ("pose", "translation")}
+
+
 def sides(pose: np.ndarray) -> np.ndarray:
     """A pose whose left and right joints are exchanged."""
     names = [n.replace("left", "*").replace("right", "left").replace("*", "right") for n in SMPL_JOINTS]
@@ -294,8 +300,9 @@ FRAMES = {
         ("1.1 times as large", REFUSED, r"1\.10 times the body's size", moved(1.1 * np.eye(3))),
         ("1.3 times as large", REFUSED, r"ividing its positions by 1\.(29|3)", moved(1.3 * np.eye(3))),
         ("1.6 times as large", REFUSED, r"ividing its positions by 1\.(59|6)", moved(1.6 * np.eye(3))),
-        ("moved by 5 cm to the side", WARNED, r"lies \(0\.05, .*m from it", moved(np.eye(3), (0.05, 0, 0))),
-        ("moved by 5 cm up", WARNED, r"lies \(-?0\.00, 0\.05, .*m from it", moved(np.eye(3), (0, 0.05, 0))),
+        ("moved by 3.5 cm to the side", WARNED, r"lies \(0\.03, .*m from it|lies \(0\.04, .*m from it", moved(np.eye(3), (0.035, 0, 0))),
+        ("moved by 5 cm to the side", REFUSED, r"Moving it by \(-0\.05, ", moved(np.eye(3), (0.05, 0, 0))),
+        ("moved by 5 cm up", REFUSED, r"Moving it by \(-?0\.00, -0\.05, ", moved(np.eye(3), (0, 0.05, 0))),
         ("moved by 10 cm", REFUSED, r"lies \(0\.10, .*m from it", moved(np.eye(3), (0.1, 0, 0))),
         ("moved by 50 cm", REFUSED, r"Moving it by \(-0\.(49|5)", moved(np.eye(3), (0.5, 0, 0))),
         ("in another room", REFUSED, r"Moving it by \(-3\.\d\d, .*, -2\.\d\d\)", moved(np.eye(3), (3, 0, 2))),
@@ -325,8 +332,9 @@ FRAMES = {
         ("with a box beside", REFUSED, "another person or furniture", added(box)),
         ("with 5 stray points at 5 m", REFUSED, r"5 of 6005 points .*stray points", added(strays(5, 3, 6))),
         ("with 1 stray point at 100 m", REFUSED, r"1 of 6001 points .*stray points", added(strays(1, 80, 110))),
-        ("with 10 stray points at 3 dm", WARNED, r"10 of 6010 points .*stray points", added(strays(10, 0.27, 0.35))),
-        ("with a point at 1e30", REFUSED, r"1 of 6000 points|finite", put("scan_pc", 7, 1e30)),
+        ("with 10 stray points at 3 dm", REFUSED, r"10 of 6010 points .*stray points", added(strays(10, 0.27, 0.35))),
+        ("with 1 stray point at 3 dm", WARNED, r"1 of 6001 points .*stray points", added(strays(1, 0.27, 0.33))),
+        ("with a point at 1e30", REFUSED, r"1 of 6000 points .*up to 1e\+30 m", put("scan_pc", 7, 1e30)),
         ("with a NaN point", REFUSED, "scan_pc: expected finite numbers, got 3 NaN", put("scan_pc", 7, np.nan)),
         ("with an infinite coordinate", REFUSED, "scan_pc: expected finite numbers", put("scan_pc", (7, 1), np.inf)),
         ("with a NaN normal", REFUSED, "scan_n: expected finite numbers", put("scan_n", 7, np.nan)),
@@ -336,14 +344,17 @@ FRAMES = {
         ("with normals either way", REFUSED, r"only \d\d% do\. Orient them", flipped(0.5)),
         ("with a fifth of the normals inward", WARNED, r"only (7|8)\d% do", flipped(0.2)),
         ("with normals of another order", REFUSED, r"only \d\d% do|do not fit", changed(scan_n=lambda n: np.random.default_rng(0).permutation(n))),
-        ("with normals still z-up", REFUSED, r"scan normals: .*turn", changed(scan_n=lambda n: n @ turn("x", 90).T)),
+        ("with normals still z-up", REFUSED, r"scan normals: .*turned alike", changed(scan_n=lambda n: n @ turn("x", 90).T)),
         ("with normals all upward", REFUSED, r"scan normals", changed(scan_n=lambda n: np.tile(np.float32([0, 1, 0]), (len(n), 1)))),
         ("with every point twice", READ, "", changed(scan_pc=lambda p: np.repeat(p, 2, 0), scan_n=lambda n: np.repeat(n, 2, 0))),
         ("with noise of 2 mm", READ, "", changed(scan_pc=lambda p: p + np.random.default_rng(0).normal(scale=0.002, size=p.shape))),
         ("with noise of 3 cm", WARNED, r"scan: .*noise", changed(scan_pc=lambda p: p + np.random.default_rng(0).normal(scale=0.03, size=p.shape))),
         ("with points and normals of other counts", REFUSED, "scan_n: expected shape", changed(scan_n=lambda n: n[:-1])),
         ("as doubles", READ, "", changed(scan_pc=lambda p: p.astype(np.float64))),
-        ("as half floats", WARNED, "scan_pc: .*float16.*float32", changed(scan_pc=lambda p: p.astype(np.float16))),
+        ("as half floats", READ, "", changed(scan_pc=lambda p: p.astype(np.float16))),
+        ("as half floats, 5 m from the origin", REFUSED, r"scan_pc: .*float16 rounds those at \d", lambda f, base: away(f, 5, np.float16)),
+        ("10 km from the origin", WARNED, r"float32 rounds those at 1e\+04 m to 0.00098 m", lambda f, base: away(f, 1e4, np.float64)),
+        ("1000 km from the origin", REFUSED, r"float32 rounds those at 1e\+06 m", lambda f, base: away(f, 1e6, np.float64)),
         ("big-endian", READ, "", changed(scan_pc=lambda p: p.astype(">f4"), scan_n=lambda n: n.astype(">f8"))),
         ("in Fortran order", READ, "", changed(scan_pc=np.asfortranarray)),
         ("as whole millimetres", REFUSED, "scan_pc: expected float, got int", changed(scan_pc=lambda p: (1000 * p).astype(np.int32))),
@@ -365,7 +376,7 @@ FRAMES = {
         ("a mesh with faces from 1", REFUSED, r"scan_faces: expected indices in \[0", with_mesh(lambda f: f | {"scan_faces": f["scan_faces"] + 1})),
         ("a mesh with faces of floats", REFUSED, "scan_faces: expected int, got float", with_mesh(lambda f: f | {"scan_faces": f["scan_faces"].astype(np.float32)})),
         ("a mesh of quads", REFUSED, r"scan_faces: expected shape \(F, 3\)", with_mesh(lambda f: f | {"scan_faces": np.pad(f["scan_faces"], ((0, 0), (0, 1)))})),
-        ("with colours from 0 to 255 as floats", REFUSED, "scan_colors", lambda f, base: f | {"scan_colors": np.full((len(f["scan_pc"]), 3), 200.0)}),
+        ("with colours from 0 to 255 as floats", REFUSED, "colours from 0 to 1, got 200", lambda f, base: f | {"scan_colors": np.full((len(f["scan_pc"]), 3), 200.0)}),
     ],
     "fit": [
         ("pose alone", READ, "", lacking("body_verts", "vtransf")),
