@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -153,9 +153,11 @@ class PackedOutfit(Outfit):
         transforms = whole if whole is not None else skinned if posed is None else posed.vertex_transforms
         if vertices is None:
             vertices = _move(transforms, template)
-        check_size(vertices, template, path)
+        if doubt := check_size(vertices, template, path):
+            self._doubt("size", path, doubt)
         if posed is not None:
-            check_posed(posed.vertices, vertices, "pose", template, path)
+            others = self._mistaken_poses(stored["pose"], vertices)
+            check_posed(posed.vertices, vertices, "pose", template, path, others)
         if given:
             check_posed(_move(skinned, template), vertices, "joint_transforms", template, path)
         if whole is not None:
@@ -173,6 +175,20 @@ class PackedOutfit(Outfit):
             translation=stored.get("translation", np.zeros(3, np.float32) if posed is None else posed.translation),
             pose=stored.get("pose"),
         )
+
+    def _mistaken_poses(self, pose: np.ndarray, vertices: np.ndarray) -> dict[str, Callable[[], np.ndarray]]:
+        """The body, as far along as ``vertices (V, 3)``, in poses that a frame's may have been mistaken for."""
+        names = list(self.template.joint_names)
+        sides = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in names]
+        poses = {"Negated": -pose, "With the root at rest": np.concatenate([0 * pose[:1], pose[1:]])}
+        if set(sides) == set(names):
+            poses["With left and right exchanged"] = pose[[names.index(name) for name in sides]]
+
+        def place(pose: np.ndarray) -> np.ndarray:
+            posed = self.fit_pose(pose).vertices
+            return posed + (vertices - posed).mean(axis=0)
+
+        return {words: partial(place, pose) for words, pose in poses.items()}
 
     def _joint_transforms(
         self, stored: dict[str, np.ndarray], posed: BodyFit | None, whole: np.ndarray | None, path: Path

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ from avatar.records import Frame, Scan, Template
 
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
+LONG_EDGE, SAME_WAY = 0.15, 0.05  # median edge to size of a body; share of directed edges that two faces have
 UNITS = {"cm": "centimetres", "mm": "millimetres", "in": "inches"}
 LIKE = 1.5  # times larger or smaller than a unit would make it, and still taken for it
 FEWEST_POINTS = 100
@@ -75,6 +76,7 @@ def check_template(template: Template, path: Path) -> None:
     """
     extents = np.ptp(template.vertices.numpy(), axis=0)
     low, high = BODY_HEIGHT
+    _check_edges(template, path)
     if low <= extents.max() <= high:
         _check_axes(template, path)
     if not low <= extents[1] <= high:
@@ -101,6 +103,21 @@ def _check_axes(template: Template, path: Path) -> None:
     if height < depth / 2:
         problem = f"vertices: expected a body that stands along y, it is {height:.2f} m high and {depth:.2f} m deep."
         raise DataError(path, problem, TURNS["+y", "+z"])
+
+
+def _check_edges(template: Template, path: Path) -> None:
+    """Refuses faces that are not those of the vertices, or not wound one way."""
+    vertices, faces = template.vertices.numpy(), template.faces.numpy()
+    starts, ends = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    length = float(np.median(np.linalg.norm(vertices[ends] - vertices[starts], axis=1)))
+    size = float(np.ptp(vertices, axis=0).max())
+    if length > LONG_EDGE * size:
+        problem = f"faces: expected edges that are short against the body, half of them are {length / size:.0%} of it."
+        raise DataError(path, problem, "Are the faces those of these vertices, in their order?")
+    _, counts = np.unique(starts * len(vertices) + ends, return_counts=True)
+    if (share := float((counts > 1).mean())) > SAME_WAY:
+        problem = f"faces: expected neighbours to run along their edge either way, on {share:.0%} of edges they do not."
+        raise DataError(path, problem, "They are not wound one way: recompute their orientation (MeshLab, Blender).")
 
 
 def _axis_along(direction: np.ndarray) -> str:
@@ -180,9 +197,25 @@ def check_frame(frame: Frame, template: Template, path: Path) -> dict[str, str]:
     return doubts | _check_normals(overlap, scan, path)
 
 
-def check_size(body: np.ndarray, template: Template, path: Path) -> None:
-    """Refuses a posed body ``(V, 3)`` in other units than its template. Raises `DataError` with the factor."""
+def check_size(body: np.ndarray, template: Template, path: Path) -> str:
+    """Refuses a posed body ``(V, 3)`` in other units than its template, or of another person; gives a doubt, or "".
+
+    Raises `DataError` with the factor: of the bounding boxes, or the median of the edges' lengths, which poses keep.
+    """
     _check_ratio("body", body, template.vertices.numpy(), "at rest", path)
+    edges = template.faces[:, :2].numpy()[thin(len(template.faces), 2000)]
+    lengths = [
+        np.linalg.norm(np.diff(v[edges].astype(np.float64), axis=1)[:, 0], axis=1)
+        for v in (body, template.vertices.numpy())
+    ]
+    ratio = float(np.median(lengths[0] / np.maximum(lengths[1], 1e-9)))
+    if abs(ratio - 1) <= SCALE[0]:
+        return ""
+    problem = f"body: expected it to be as large as at rest, its edges are {ratio:.2f} times as long."
+    hint = "Is it the body of this person, of the same shape (betas) as the template?"
+    if abs(ratio - 1) > SCALE[1]:
+        raise DataError(path, problem, hint)
+    return f"{problem} {hint}"
 
 
 def _check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, path: Path) -> None:
@@ -340,10 +373,18 @@ def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> dict[str, str]:
     return doubts
 
 
-def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Template, path: Path) -> None:
+def check_posed(
+    posed: np.ndarray,
+    vertices: np.ndarray,
+    what: str,
+    template: Template,
+    path: Path,
+    others: Mapping[str, Callable[[], np.ndarray]] | None = None,
+) -> None:
     """Refuses ``vertices (V, 3)`` that ``posed (V, 3)``, the template posed by the frame's ``what``, does not meet.
 
-    Raises `DataError` with the distance, metres, and the likely cause.
+    ``others`` give the template posed otherwise, by words for it, to find out what was mistaken. Raises `DataError`
+    with the distance, metres, and the likely cause.
     """
 
     def distance(moved: np.ndarray) -> float:  # that all but a hundredth of the vertices keep
@@ -359,6 +400,8 @@ def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Te
     elif distance(turned) <= APART:
         degrees = np.degrees(turn.magnitude())
         hint = f"Turning the whole body by {degrees:.0f} degrees would: is the root's rotation in both?"
+    elif words := next((words for words, pose in (others or {}).items() if distance(pose()) <= APART), ""):
+        hint = f"{words} it does: correct {what}."
     else:
         off = np.linalg.norm(turned - vertices, axis=1) > APART
         joint = template.joint_names[int(template.weights.numpy()[off].sum(axis=0).argmax())]
@@ -381,7 +424,11 @@ def check_vertex_transforms(transforms: np.ndarray, template: Template, vertices
     posed = vertices[ends].astype(np.float64) - vertices[starts]
     lengths = np.linalg.norm(rest, axis=1).sum()
 
-    def pose_edges(linear: np.ndarray) -> np.ndarray:
+    if (volume := float(np.median(np.linalg.det(linear)))) < 0:
+        problem = f"vtransf: expected rotations, their determinants are {volume:.2f}: they mirror."
+        raise DataError(path, problem, "Negate one coordinate of scan and body, and make the transforms anew.")
+
+    def pose_edges(linear: np.ndarray, rest: np.ndarray = rest) -> np.ndarray:
         return np.einsum("eij,ej->ei", (linear[starts] + linear[ends]) / 2, rest)
 
     def error(edges: np.ndarray) -> float:
@@ -398,6 +445,8 @@ def check_vertex_transforms(transforms: np.ndarray, template: Template, vertices
     elif error(turn.apply(skinned)) <= EDGE_ERROR:
         degrees = np.degrees(turn.magnitude())
         hint = f"Turned by {degrees:.0f} degrees as a whole it does: is the root's rotation in both?"
+    elif error(pose_edges(linear, rest * [-1, 1, 1])) <= EDGE_ERROR:
+        hint = "With the template mirrored it does: negate x of body and scan, or of the template and its faces' order."
     elif np.abs(linear - np.eye(3)).max() < 1e-3:
         hint = "It is the identity: bring this frame's transforms, or leave the key out where pose is there."
     else:
