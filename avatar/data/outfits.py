@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Self
 
@@ -59,7 +60,10 @@ class Outfit(ABC):
             kinds = f"{', '.join(SPLITS[:-1])} or {SPLITS[-1]}"
             raise AvatarError(sentences(f"split: expected {kinds}{held}, got {split!r}.", near))
         if not self._listed[split]:
-            raise DataError(self.path / split, "expected frames (*.npz), found none.", "Make or download the data.")
+            there = (p for p in sorted((self.path / split).rglob("*")) if p.is_file() and not p.name.startswith("."))
+            other = ", ".join(str(path.relative_to(self.path / split)) for path in islice(there, 3))
+            found = f"found only {other}" if other else "found none"
+            raise DataError(self.path / split, f"expected frames (*.npz), {found}.", "Make or download the data.")
         return self._listed[split]
 
     def has_frames(self, split: str) -> bool:

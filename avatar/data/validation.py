@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.packed import border_positions
 from avatar.checks import AvatarError, DataError, check_finite
 from avatar.data.alignment import (
@@ -132,6 +133,11 @@ def check_joints(template: Template, path: Path) -> None:
 
     Joints without a border (`joint_positions`) are not judged. Raises `DataError` with the largest gap and its cause.
     """
+    names = template.joint_names
+    for joint, parent in zip(SMPL_JOINTS[1:], (SMPL_JOINTS[parent] for parent in SMPL_PARENTS[1:])):
+        if joint in names and parent in names and parent not in (above := _ancestors(template, names.index(joint))):
+            problem = f"parents: expected {parent} above {joint}, there are {', '.join(above) or 'no joints'}."
+            raise DataError(path, problem, "Are parents in the order of the joints' names?")
     vertices = template.vertices.numpy()
     borders = border_positions(vertices, template.weights.numpy(), template.parents)
     judged = np.isfinite(borders[:, 0]) & (np.arange(len(borders)) > 0)
@@ -153,6 +159,14 @@ def check_joints(template: Template, path: Path) -> None:
         f"from there and half of them lie {np.median(gaps):.2f} m or more."
     )
     raise DataError(path, problem, _joint_hint(joints, borders, names, fit))
+
+
+def _ancestors(template: Template, joint: int) -> list[str]:
+    """Names of the joints above a joint, the nearest first."""
+    found = []
+    while (joint := template.parents[joint]) >= 0:
+        found.append(template.joint_names[joint])
+    return found
 
 
 def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: Callable[[np.ndarray], bool]) -> str:
