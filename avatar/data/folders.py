@@ -17,7 +17,10 @@ KNOWN_KEYS = READ_KEYS | {"name", "units", "up", "licence", "source", "garments"
 
 
 def read_outfit_settings(path: Path) -> dict[str, Any]:
-    """What ``outfit.yaml`` says, nothing where there is none; `DataError` for no mapping, an unknown format, misspelt keys."""
+    """What ``outfit.yaml`` says, nothing where there is none.
+
+    Raises `DataError` for no mapping, an unknown format or misspelt keys.
+    """
     file = Path(path) / "outfit.yaml"
     if not file.is_file():
         return {}

@@ -180,9 +180,9 @@ class PackedOutfit(Outfit):
         """The body, as far along as ``vertices (V, 3)``, in poses that a frame's may have been mistaken for."""
         names = list(self.template.joint_names)
         sides = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in names]
-        poses = {"Negated": -pose, "With the root at rest": np.concatenate([0 * pose[:1], pose[1:]])}
+        poses = {"If negated": -pose, "If its root is at rest": np.concatenate([0 * pose[:1], pose[1:]])}
         if set(sides) == set(names):
-            poses["With left and right exchanged"] = pose[[names.index(name) for name in sides]]
+            poses["If left and right are exchanged"] = pose[[names.index(name) for name in sides]]
 
         def place(pose: np.ndarray) -> np.ndarray:
             posed = self.fit_pose(pose).vertices

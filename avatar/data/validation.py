@@ -414,14 +414,15 @@ def check_posed(
     elif distance(turned) <= APART:
         degrees = np.degrees(turn.magnitude())
         hint = f"Turning the whole body by {degrees:.0f} degrees would: is the root's rotation in both?"
-    elif words := next((words for words, pose in (others or {}).items() if distance(pose()) <= APART), ""):
-        hint = f"{words} it does: correct {what}."
     else:
         off = np.linalg.norm(turned - vertices, axis=1) > APART
         joint = template.joint_names[int(template.weights.numpy()[off].sum(axis=0).argmax())]
-        hint = (
-            f"Vertices of {joint} are off most. Is {what} this frame's, with joints in the template's order, not "
-            "negated and not zeros, and are the template's shape (betas), weights and joints this person's?"
+        words = next((words for words, pose in (others or {}).items() if distance(pose()) <= APART), "")
+        hint = f"Vertices of {joint} are off most. " + (
+            f"{words} it does: correct {what}."
+            if words
+            else f"Is {what} this frame's, with joints in the template's order, not negated and not zeros, and are the "
+            "template's shape (betas), weights and joints this person's?"
         )
     problem = f"{what}: expected it to put the template on the frame's body, it leaves {1 - SHARE:.0%} of the vertices"
     raise DataError(path, f"{problem} {apart:.3f} m or more away.", hint)
