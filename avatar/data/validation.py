@@ -50,6 +50,7 @@ WOUND, DOUBTFUL_WOUND = 0.7, 0.9  # shares of faces wound as their normals say; 
 SCALE, TURN, SHIFT = (0.04, 0.08), (4.0, 10.0), (0.03, 0.06)  # share, degrees, metres
 APART_TIGHT = (0.025, 0.10)  # metres of mean distance
 ROUGH = 0.005  # metres that the scan lies off an even layer there: 1.6 mm, and 4 mm and more with 1 cm of noise
+NOISE = "That is noise, or a poor fit."
 MAJORITY, NEARLY_ALL = 0.5, 0.8  # shares of the places there on the scan: a gown may hide the feet
 STRAY, STRAY_SPREAD = 2e-3, 2e-5  # share of points, or square metres that they add to a Chamfer distance: refused
 ALONG = 0.7  # cosine to an axis from which on a direction runs along it
@@ -312,14 +313,15 @@ def _check_overlap(
     if misplaced or (apart and (not fitted or _misfit(fit, 0, samples.grain))):
         hint = suggest_hint(scan.points, scan.normals, body, faces, tight)
         if hint or misplaced or fit.before > APART_TIGHT[1] + samples.grain:
-            raise DataError(path, problem, hint or _no_correction(samples, skin, overlap))
+            rough = fitted and not apart and fit.roughness > ROUGH + samples.grain
+            raise DataError(path, problem, hint or (NOISE if rough else _no_correction(samples, skin, overlap)))
     if fitted and (words := _misfit(fit, 0, samples.grain)):
         return {"fit": f"{problem} There {words[0]} {words[1]}"}
     if apart or overlap.covered < DOUBTFUL_COVERED:
         return {"apart": f"{problem} Is the fit right, and nobody's head, hand or foot missing or covered?"}
     if fitted and fit.roughness > ROUGH + samples.grain:
         scatter = f"it lies {1000 * fit.roughness:.1f} mm (median) off an even layer over head, hands and feet"
-        return {"rough": f"scan: expected a surface, {scatter}. That is noise, or a poor fit."}
+        return {"rough": f"scan: expected a surface, {scatter}. {NOISE}"}
     return {}
 
 

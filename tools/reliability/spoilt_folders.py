@@ -75,7 +75,12 @@ BODIES = [
         "joints: expected shape",
         lambda b, base: b | {"joints": np.pad(b["joints"], ((0, 0), (0, 1)))},
     ),
-    ("no joints", READ, "", lambda b, base: {key: value for key, value in b.items() if key != "joints"}),
+    (
+        "no joints",
+        WARNED,
+        r"0\.96 times the body's size",
+        lambda b, base: {key: value for key, value in b.items() if key != "joints"},
+    ),
     ("weights transposed", REFUSED, "weights: expected shape", lambda b, base: b | {"weights": b["weights"].T}),
     ("weights that do not sum to 1", REFUSED, "weights: .*sum", lambda b, base: b | {"weights": b["weights"] * 0.7}),
     ("weights that are negative", REFUSED, "weights: ", put("weights", (3, 2), -0.5)),
@@ -167,6 +172,20 @@ def all_frames(change: Callable) -> Callable:
         for path, arrays in base.frames.items():
             if path.startswith("train"):
                 save(folder / path, change(base.copy(arrays), base))
+
+    return spoil
+
+
+def as_obj(change: Callable[[Arrays], Arrays]) -> Callable:
+    """An outfit whose body is a ``template.obj`` alone, and whose frames bring vertices and transforms."""
+
+    def spoil(folder: Path, base: Base) -> None:
+        body = change(base.copy(base.body))
+        lines = [f"v {x} {y} {z}" for x, y, z in body["vertices"]] + [f"f {a} {b} {c}" for a, b, c in body["faces"] + 1]
+        (folder / "template.npz").unlink()
+        (folder / "template.obj").write_text("\n".join(lines))
+        for path, arrays in base.frames.items():
+            save(folder / path, {key: arrays[key] for key in (*ON, "body_verts", "vtransf")})
 
     return spoil
 
@@ -275,6 +294,10 @@ FOLDERS = [
             lacking("vtransf")(base.frames[FRAME], base) | {"body_verts": base.frames[FRAME]["body_verts"][:100]},
         ),
     ),
+    ("a template.obj for the body", READ, "", as_obj(lambda b: b)),
+    ("a template.obj wound inward", REFUSED, "wound inward", as_obj(lambda b: b | {"faces": b["faces"][:, ::-1]})),
+    ("a template.obj in inches", REFUSED, "inches", as_obj(lambda b: b | {"vertices": b["vertices"] / 0.0254})),
+    ("a template.obj z up", REFUSED, "degrees about x", as_obj(lambda b: turned_body(turn("x", 90))(b, None))),
     ("no body", REFUSED, "expected template.npz or template.obj", without("template.npz")),
     ("a body cut off", REFUSED, r"template\.npz: expected a valid npz file", truncated("template.npz", 0.5)),
     (

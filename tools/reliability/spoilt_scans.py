@@ -309,9 +309,15 @@ SCANS = [
         changed(scan_pc=lambda p: p + np.random.default_rng(0).normal(scale=0.002, size=p.shape)),
     ),
     (
-        "with noise of 3 cm",
+        "with noise of 1.5 cm",
         WARNED,
-        r"scan: .*noise",
+        "scan: .*off an even layer.*noise",
+        changed(scan_pc=lambda p: p + np.random.default_rng(0).normal(scale=0.015, size=p.shape)),
+    ),
+    (
+        "with noise of 3 cm",
+        REFUSED,
+        "lies deep inside. That is noise",
         changed(scan_pc=lambda p: p + np.random.default_rng(0).normal(scale=0.03, size=p.shape)),
     ),
     (
