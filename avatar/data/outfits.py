@@ -18,7 +18,8 @@ import torch
 from avatar.body.model import BodyModel
 from avatar.checks import AvatarError, DataError, did_you_mean, sentences
 from avatar.data.folders import SPLITS, VALIDATION
-from avatar.data.validation import check_frame, check_joints, check_pose, check_template
+from avatar.data.scan_validation import check_frame
+from avatar.data.validation import check_joints, check_pose, check_template
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Template
 
@@ -30,6 +31,8 @@ class Outfit(ABC):
 
     Where the true surface is known, there are ``resample`` and ``load_mesh`` as well (`OpenOutfit`).
     """
+
+    measured = True  # scans as a scanner gives them
 
     def __init__(self, path: Path, dataset: str = ""):
         self.held_back: tuple[str, ...] = ()
@@ -86,7 +89,8 @@ class Outfit(ABC):
         """
         path = self.frame_path(split, name)
         frame = self._read_frame(path, split, name)
-        for kind, doubt in check_frame(frame, self.template, path).items():
+        doubts = check_frame(frame, self.template, path, self.measured)
+        for kind, doubt in doubts.items() if self.measured else ():
             self._doubt(kind, path, doubt)
         return frame
 

@@ -1,4 +1,4 @@
-"""Checks of what is loaded: units, axes, overlap of scan and body, normals, and that a frame's parts say the same."""
+"""Checks of bodies and fits: units, axes, faces, joints, and that a frame's pose, transforms and vertices agree."""
 
 from __future__ import annotations
 
@@ -11,48 +11,16 @@ from scipy.spatial.transform import Rotation
 from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.packed import border_positions
 from avatar.checks import AvatarError, DataError, check_finite
-from avatar.data.alignment import (
-    FAR,
-    INSIDE_OUT,
-    NEAR,
-    UNORIENTED,
-    Overlap,
-    ScanSamples,
-    Similarity,
-    Skin,
-    find_stray,
-    fit_similarity,
-    sample_skin,
-    show_vector,
-    suggest_hint,
-    thin,
-    tight_weights,
-)
+from avatar.data.alignment import show_vector, thin
 from avatar.geometry.units import METRES, USUAL, possible_units
-from avatar.records import Frame, Scan, Template
+from avatar.records import Template
 
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
 LONG_EDGE, SAME_WAY = 0.15, 0.05  # median edge to size of a body; share of directed edges that two faces have
 UNITS = {"cm": "centimetres", "mm": "millimetres", "in": "inches"}
 LIKE = 1.5  # times larger or smaller than a unit would make it, and still taken for it
-FEWEST_POINTS = 100
-FAR_OFF = 10.0  # metres between the middles of scan and body that only a translation in other units explains
-# Valid frames (sample, dress, skirt, jacket; perfect and raw scans, all poses) cover 92% and more of the
-# body, bury 0.2% at most, 93% of their normals point outward, with a mean cosine of 0.71 to the skin's.
-LEAST_COVERED, MOST_BURIED = 0.7, 0.05  # each alone is a misfit
-DOUBTFUL_COVERED, DOUBTFUL_BURIED, DOUBTFUL_OUTWARD = 0.85, 0.01, 0.8  # the first with one of the others
-ACROSS = 0.5  # mean cosine between normals of scan and skin; 0.4 for normals turned by 90 degrees
-WOUND, DOUBTFUL_WOUND = 0.7, 0.9  # shares of faces wound as their normals say; 0.99 in raw meshes
-# At head, hands and feet valid scans lie within 1.4 cm on average (2.1 cm with hair and shoes added), and have 0.1%
-# (2.7%) of another size, 0.3 (0.8) degrees of turn and 0.2 cm (0.8 cm) of shift. The first is a doubt, the second
-# refused.
-SCALE, TURN, SHIFT = (0.04, 0.08), (4.0, 10.0), (0.03, 0.06)  # share, degrees, metres
-APART_TIGHT = (0.025, 0.10)  # metres of mean distance
-ROUGH = 0.005  # metres that the scan lies off an even layer there: 1.6 mm, and 4 mm and more with 1 cm of noise
-NOISE = "That is noise, or a poor fit."
-MAJORITY, NEARLY_ALL = 0.5, 0.8  # shares of the places there on the scan: a gown may hide the feet
-STRAY, STRAY_SPREAD = 2e-3, 2e-5  # share of points, or square metres that they add to a Chamfer distance: refused
+DIFFERENT_SIZE = (0.04, 0.08)  # share that a body or scan is larger or smaller than it should be: doubtful, refused
 ALONG = 0.7  # cosine to an axis from which on a direction runs along it
 MOST_TURN = 2 * np.pi + 0.1  # radians; no joint turns farther, and degrees soon exceed it
 JOINT_GAP, JOINTS_GAP = 0.25, 0.12  # metres from a joint to its weights' border: one, median (open body: 0.13, 0.04)
@@ -184,56 +152,28 @@ def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: 
     return "Are joints in the order of the weights' columns, at rest, in metres, in the vertices' coordinates?"
 
 
-def check_frame(frame: Frame, template: Template, path: Path) -> dict[str, str]:
-    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out.
-
-    Gives what is doubtful and read all the same, as messages by kind. Raises `DataError` with the measured figure and
-    the likely cause.
-    """
-    scan, body, faces = frame.scan, frame.body.vertices, template.faces.numpy()
-    if len(scan.points) < FEWEST_POINTS:
-        problem = f"scan: expected at least {FEWEST_POINTS} points, got {len(scan.points)}."
-        raise DataError(path, problem, "Leave the frame out or scan it again.")
-    check_size(body, template, path)
-    lengths = np.sqrt(np.einsum("mi,mi->m", scan.normals, scan.normals))
-    if lengths.min() < 0.5 or (np.abs(lengths - 1) > 0.05).mean() > 0.01:
-        problem = f"scan normals: expected unit length, got {lengths.min():.3g} to {lengths.max():.3g}."
-        raise DataError(path, problem, "Normalise them, or compute them anew.")
-    tight = tight_weights(template)
-    samples, skin = ScanSamples(scan.points, scan.normals), sample_skin(body, faces, tight)
-    overlap = samples.overlap(skin)
-    there = overlap.covered >= DOUBTFUL_COVERED  # the person; what else there is says nothing of units and fit
-    doubts = _check_stray(scan, skin, path) if there else {}
-    if not there:
-        ends = np.quantile(samples.points, [0.02, 0.98], axis=0)  # whatever a few stray points say
-        _check_ratio("scan", ends, body, "the body", path)
-    doubts |= _check_overlap(overlap, samples, skin, frame, faces, tight, path)
-    doubts |= {} if there else _check_stray(scan, skin, path)
-    return doubts | _check_normals(overlap, scan, path)
-
-
 def check_size(body: np.ndarray, template: Template, path: Path) -> str:
     """Refuses a posed body ``(V, 3)`` in other units than its template, or of another person; gives a doubt, or "".
 
     Raises `DataError` with the factor: of the bounding boxes, or the median of the edges' lengths, which poses keep.
     """
-    _check_ratio("body", body, template.vertices.numpy(), "at rest", path)
+    check_ratio("body", body, template.vertices.numpy(), "at rest", path)
     edges = template.faces[:, :2].numpy()[thin(len(template.faces), 2000)]
     lengths = [
         np.linalg.norm(np.diff(v[edges].astype(np.float64), axis=1)[:, 0], axis=1)
         for v in (body, template.vertices.numpy())
     ]
     ratio = float(np.median(lengths[0] / np.maximum(lengths[1], 1e-9)))
-    if abs(ratio - 1) <= SCALE[0]:
+    if abs(ratio - 1) <= DIFFERENT_SIZE[0]:
         return ""
     problem = f"body: expected it to be as large as at rest, its edges are {ratio:.2f} times as long."
     hint = "Is it the body of this person, of the same shape (betas) as the template?"
-    if abs(ratio - 1) > SCALE[1]:
+    if abs(ratio - 1) > DIFFERENT_SIZE[1]:
         raise DataError(path, problem, hint)
     return f"{problem} {hint}"
 
 
-def _check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, path: Path) -> None:
+def check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, path: Path) -> None:
     """Refuses points of another size than those they should be like, by the diagonals of their bounding boxes."""
     size, expected = (float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (points, like))
     low, high = SIZE_RATIO
@@ -256,137 +196,6 @@ def _unit_hint(units: Sequence[str], ratio: float) -> str:
     if 1 / LIKE < ratio * 1000 < LIKE:
         return "That looks like kilometres, or metres scaled twice: multiply positions and translations by 1000."
     return "Positions must be in metres with y up, and a scan must hold nothing but the person."
-
-
-def _check_stray(scan: Scan, skin: Skin, path: Path) -> dict[str, str]:
-    """Refuses a scan with much that is not the person; little of it is a doubt."""
-    stray = find_stray(scan.points, scan.normals, skin)
-    if not stray.count:
-        return {}
-    share, shape = stray.count / len(scan.points), " on a plane" if stray.flat else ""
-    problem = (
-        f"scan: expected the person alone, {stray.count} of {len(scan.points)} points ({share:.2%}) lie apart from the "
-        f"body{shape}, up to {stray.farthest:.3g} m from it."
-    )
-    if stray.flat:
-        hint = "That looks like a floor or wall: cut it off."
-    elif share > 0.05:
-        hint = f"That looks like another person or furniture: keep what lies within {FAR:.1f} m of the body."
-    else:
-        hint = "Those look like stray points: remove small pieces that are not joined to the person."
-    if share < STRAY and stray.spread < STRAY_SPREAD:
-        return {"stray": f"{problem} {hint}"}
-    raise DataError(path, problem, hint)
-
-
-def _check_overlap(
-    overlap: Overlap,
-    samples: ScanSamples,
-    skin: Skin,
-    frame: Frame,
-    faces: np.ndarray,
-    tight: np.ndarray | None,
-    path: Path,
-) -> dict[str, str]:
-    """Refuses a scan that does not lie over its body, with the move, turn or scale that would lay it there."""
-    scan, body, known = frame.scan, frame.body.vertices, tight is not None
-    inside_out = overlap.outward < INSIDE_OUT
-    oriented = -1.0 if inside_out else float(overlap.outward >= UNORIENTED)
-    fit = fit_similarity(samples, skin, oriented)
-    misplaced = overlap.covered < LEAST_COVERED or overlap.buried > MOST_BURIED
-    misplaced |= overlap.covered < DOUBTFUL_COVERED and (
-        overlap.buried > DOUBTFUL_BURIED or (overlap.outward < DOUBTFUL_OUTWARD and not inside_out)
-    )
-    reached = f" head, hands and feet lie {100 * fit.before:.1f} cm from it" if known else ""
-    problem = (
-        f"scan: expected it over its body, {overlap.covered:.0%} of the body has a scan point within {NEAR:.2f} m,"
-        f"{reached} and {overlap.buried:.0%} of the scan lies deep inside."
-    )
-    shift = np.median(body, axis=0) - np.median(scan.points, axis=0)
-    if np.abs(shift).max() > FAR_OFF:
-        hint = f"Their middles differ by {show_vector(shift, 1)} m: is the translation in metres?"
-        raise DataError(path, problem, hint)
-    fitted = known and fit.share > MAJORITY
-    if known and fit.share > NEARLY_ALL and (words := _misfit(fit, 1, samples.grain)):
-        raise DataError(path, f"{problem} There {words[0]}", words[1])
-    apart = known and fit.before > APART_TIGHT[0] + samples.grain
-    if misplaced or (apart and (not fitted or _misfit(fit, 0, samples.grain))):
-        hint = suggest_hint(scan.points, scan.normals, body, faces, tight)
-        if hint or misplaced or fit.before > APART_TIGHT[1] + samples.grain:
-            rough = fitted and not apart and fit.roughness > ROUGH + samples.grain
-            raise DataError(path, problem, hint or (NOISE if rough else _no_correction(samples, skin, overlap)))
-    if fitted and (words := _misfit(fit, 0, samples.grain)):
-        return {"fit": f"{problem} There {words[0]} {words[1]}"}
-    if apart or overlap.covered < DOUBTFUL_COVERED:
-        return {"apart": f"{problem} Is the fit right, and nobody's head, hand or foot missing or covered?"}
-    if fitted and fit.roughness > ROUGH + samples.grain:
-        scatter = f"it lies {1000 * fit.roughness:.1f} mm (median) off an even layer over head, hands and feet"
-        return {"rough": f"scan: expected a surface, {scatter}. {NOISE}"}
-    return {}
-
-
-def _misfit(fit: Similarity, level: int, grain: float) -> tuple[str, str] | tuple[()]:
-    """What of a similarity is beyond the limits of a level, 0 doubtful or 1 refused, and the hint; empty if nothing.
-
-    The limits are wider by ``grain``, metres, where scan points lie farther apart (`ScanSamples`).
-    """
-    if abs(fit.scale - 1) > SCALE[level] + grain:
-        hint = f"Divide its positions by {fit.scale:.2f}, or the body has another person's shape (betas) or size."
-        return f"it has {fit.scale:.2f} times the body's size.", hint
-    parts = []
-    if fit.degrees > TURN[level] + np.degrees(grain):
-        parts.append(
-            f"is turned by {fit.degrees:.0f} degrees about {show_vector(fit.turn / np.linalg.norm(fit.turn), 1)}"
-        )
-    if np.linalg.norm(fit.shift) > SHIFT[level] + grain:
-        parts.append(f"lies {show_vector(fit.shift)} m from it")
-    return (f"it {' and '.join(parts)}.", "Undo that to the scan, or do it to the fit.") if parts else ()
-
-
-def _no_correction(samples: ScanSamples, skin: Skin, overlap: Overlap) -> str:
-    """The likely cause where no move, turn, mirror or scale lays a scan over its body."""
-    gaps = skin.tree.query(samples.points)[0]
-    if overlap.buried <= MOST_BURIED and np.quantile(gaps, 0.9) < NEAR and overlap.covered < DOUBTFUL_COVERED:
-        return "What there is of the scan lies on the body: is part of the person missing from it?"
-    return (
-        "Neither a move, a turn by right angles, a mirror nor a scale corrects it: is the fit of another frame or "
-        "person?"
-    )
-
-
-def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> dict[str, str]:
-    """Refuses normals that point inward, or either way, and faces that are wound against them."""
-    doubts = {}
-    if overlap.outward < INSIDE_OUT:
-        problem = f"scan normals: expected them to point outward, {1 - overlap.outward:.0%} point into the body."
-        raise DataError(path, problem, "The scan is inside out: multiply its normals by -1.")
-    if overlap.outward >= UNORIENTED and overlap.cosine < ACROSS:
-        found = f"their mean cosine to the body's is {overlap.cosine:.2f}"
-        problem = f"scan normals: expected them to stand on the surface, {found}."
-        raise DataError(path, problem, "Were points and normals turned alike? Else compute them anew.")
-    if overlap.outward < DOUBTFUL_OUTWARD:
-        problem = f"scan normals: expected them to point outward, only {overlap.outward:.0%} do."
-        hint = "Orient them (MeshLab, Open3D), or compute them from the mesh."
-        if overlap.outward < UNORIENTED:
-            raise DataError(path, problem, hint)
-        doubts["normals"] = f"{problem} {hint}"
-    if scan.faces is None:
-        return doubts
-    some = scan.faces[thin(len(scan.faces), 1000)]
-    a, b, c = (scan.points[some[:, corner]] for corner in range(3))
-    agree = float(((np.cross(b - a, c - a) * scan.normals[some].sum(axis=1)).sum(axis=1) > 0).mean())
-    if agree < DOUBTFUL_WOUND:
-        problem = f"scan faces: expected them counter-clockwise from outside, {1 - agree:.0%} are not."
-        hint = "Are they this scan's, all wound one way?"
-        if agree < INSIDE_OUT:
-            hint = (
-                "Either the scan is mirrored (compare left and right with a picture; negate one coordinate of points "
-                "and normals), or its faces are wound inward (swap two of their columns)."
-            )
-        if agree < WOUND:
-            raise DataError(path, problem, hint)
-        doubts["faces"] = f"{problem} {hint}"
-    return doubts
 
 
 def check_posed(

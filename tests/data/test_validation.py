@@ -13,9 +13,9 @@ from avatar.body.open import open_body
 from avatar.checks import AvatarError, DataError
 from avatar.data.alignment import measure_overlap, suggest_hint
 from avatar.data.layouts import find_outfit
+from avatar.data.scan_validation import check_frame
 from avatar.data.scanner import SCANNERS
 from avatar.data.validation import (
-    check_frame,
     check_frame_count,
     check_pose,
     check_template,
