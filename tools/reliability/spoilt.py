@@ -45,6 +45,11 @@ class Result:
     untyped: str = ""
 
     @property
+    def silent(self) -> bool:
+        """Whether it was read without a word although it should not have been."""
+        return self.outcome == READ != self.spoilt.wanted
+
+    @property
     def met(self) -> bool:
         """Whether the outcome is the wanted one, with its cause."""
         right = self.outcome == self.spoilt.wanted and not self.untyped

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import shutil
+import textwrap
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from avatar.data.layouts import open_outfit_folder
 from avatar.data.splits import split_outfit
 from avatar.geometry.surface import vertex_normals
 from avatar.io.motions import read_motion
+from avatar.io.npz import write_whole
 from avatar.io.surfaces import read_surface
 from reliability.findings import Finding, all_of, none_of
 from reliability.spoilt import FRAME, READ, REFUSED, WARNED, Base, Result, Spoilt, save
@@ -26,6 +28,9 @@ from reliability.spoilt_files import MESHES, MOTIONS, Shape
 from reliability.spoilt_fits import FITS
 from reliability.spoilt_folders import BODIES, FOLDERS
 from reliability.spoilt_scans import SCANS
+
+SHOWN = 240  # characters of a message in the table
+AGAIN = " (Others like it are not mentioned.)"
 
 
 def all_spoilt() -> list[Spoilt]:
@@ -109,25 +114,30 @@ READERS = {"scan": _read_frame, "fit": _read_frame, "body": _read_body, "folder"
 READERS |= {"motion": _read_motion, "mesh": _read_mesh}
 
 
-def spoilt_trial(root: Path) -> list[Finding]:
-    """Reads data spoilt in every way, and counts what came of it; the table goes to ``<root>/spoilt_data.md``."""
+def spoilt_trial(root: Path, out: Path) -> list[Finding]:
+    """Reads data spoilt in every way, and counts what came of it; the table of all goes to ``<out>/spoilt_data.md``."""
     base = Base(root)
     results = [read_spoilt(spoilt, base, root / "data") for spoilt in all_spoilt()]
-    (root / "spoilt_data.md").write_text(spoilt_table(results))
-    counts = Counter(result.outcome for result in results if result.met)
-    wanted = Counter(result.spoilt.wanted for result in results)
-    total = len(results)
+    write_whole(out / "spoilt_data.md", spoilt_table(results).encode())
+    met = Counter(result.outcome for result in results if result.met)
+    wanted, total = Counter(result.spoilt.wanted for result in results), len(results)
+    found = {
+        READ: "valid in another form, and read",
+        WARNED: "doubtful, read with a warning that has figure and cause",
+        REFUSED: "harmful, refused with file and true cause",
+    }
     return [
-        *(all_of("spoilt", f"{outcome}, as it should be", counts[outcome], wanted[outcome]) for outcome in wanted),
-        none_of("spoilt", "accepted in silence", sum(r.outcome == READ != r.spoilt.wanted for r in results), total),
+        *(all_of("spoilt", words, met[outcome], wanted[outcome]) for outcome, words in found.items()),
+        none_of("spoilt", "harmful or doubtful and read in silence", sum(r.silent for r in results), total),
         none_of("spoilt", "refused with an untyped error", sum(bool(r.untyped) for r in results), total),
     ]
 
 
 def spoilt_table(results: list[Result]) -> str:
     """What was spoilt and what came of it, as Markdown."""
-    lines = ["| part | what was spoilt | came of it | message |", "|---|---|---|---|"]
+    lines = ["| data | what is spoilt | came of it | figure and cause |", "|---|---|---|---|"]
     for result in results:
-        message = re.sub(r"\s+", " ", result.message).replace("|", "\\|")
-        lines.append(f"| {result.spoilt.part} | {result.spoilt.words} | {result.outcome} | {message} |")
+        message = re.sub(r"\s+", " ", result.message.partition(": ")[2]).replace("|", "\\|").replace(AGAIN, "")
+        shown = textwrap.shorten(message, SHOWN, placeholder=" ...")
+        lines.append(f"| {result.spoilt.part} | {result.spoilt.words} | {result.outcome} | {shown} |")
     return "\n".join(lines) + "\n"
