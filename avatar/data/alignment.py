@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import permutations, product
 
 import numpy as np
 from scipy.ndimage import label
@@ -27,13 +28,15 @@ TIGHT, FEWEST_TIGHT = 0.8, 60  # share of a place's skinning weights that these 
 TIGHT_CLIP = 0.15  # metres; no place counts for more
 ALIGNED, CURE = 0.03, 0.5  # metres at which a correction fits, and the share of the distance that it may leave
 CURED, CURED_BURIED = 0.9, 0.05  # share of the body that a suggestion must bring near the scan, and of scan buried
-LARGER, SCALE_SHOWN = 0.1, 0.03  # share of another size from which on it is tried, and mentioned
+LARGER, SCALE_SHOWN, TURN_SHOWN = 0.1, 0.03, 4.0  # sizes tried, sizes and turns (degrees) mentioned
+SIMPLER, ROUNDED = 2e-3, 1e-4  # metres that a suggestion with a move, or another one, must be nearer
 ROUNDS, SAME_SIDE = 6, 0.3  # of the fit; cosine between the normals of body and scan
 INSIDE_OUT, UNORIENTED = 0.25, 0.7  # shares of normals that point outward
 CELL = 0.05  # metres; scan points are counted in cubes of this size
 FAR = 0.60  # metres from the skin beyond which nothing is worn
 JOINED = 0.15  # metres from the skin within which a piece of the scan belongs to the person
-FLAT, FLAT_NORMALS, WIDE = 0.02, 0.9, 0.6  # metres thick, share of squared normals along one axis, metres: a floor
+WORN = 0.45  # metres: the widest dress comes to 0.41
+FLAT, FLAT_NORMALS, WIDE = 0.02, 0.9, 0.4  # metres thick, share of squared normals along one axis, metres: a floor
 
 
 @dataclass(frozen=True)
@@ -145,12 +148,17 @@ class ScanSamples:
 class Stray:
     """Points of a scan that are not the person: ``count`` of them, the ``farthest`` from the skin, metres, and whether
     they lie on a plane, as a floor or wall. ``spread`` is what they add to a Chamfer distance, square metres.
+
+    Of the points that are joined to the person, ``facing`` is the share of the scan that lies beside the body and looks
+    at it, as another person's side does, ``beyond`` the share of it that lies `WORN` or more from the skin.
     """
 
     count: int = 0
     farthest: float = 0.0
     flat: bool = False
     spread: float = 0.0
+    facing: float = 0.0
+    beyond: float = 0.0
 
 
 def find_stray(points: np.ndarray, normals: np.ndarray, skin: Skin) -> Stray:
@@ -170,23 +178,31 @@ def find_stray(points: np.ndarray, normals: np.ndarray, skin: Skin) -> Stray:
     places = np.flatnonzero(counts)
     centres = low + (np.stack(np.unravel_index(places, shape), axis=1) + 0.5) * cell
     gaps, _ = skin.tree.query(centres)
-    beside, stray = gaps > max(JOINED, cell), gaps > FAR
+    beside, stray, flat, facing = gaps > max(JOINED, cell), gaps > FAR, False, 0.0
     if beside.any():
         pieces = label(counts.reshape(shape) > 0, np.ones((3, 3, 3), bool))[0].reshape(-1)[places]
         stray |= ~np.isin(pieces, np.unique(pieces[~beside]))
-        flags = np.zeros(counts.size, bool)
-        flags[places[beside]] = True
-        loose = np.flatnonzero(inside & flags[cells])
-        if flat := len(loose) > len(points) / 100 and is_flat(points[loose], normals[loose]):
-            stray |= beside
-    else:
-        flat = False
+        loose = np.zeros(counts.size, bool)
+        loose[places[beside]] = True
+        loose = np.flatnonzero(inside & loose[cells])
+        flat = len(loose) > len(points) / 100 and is_flat(points[loose], normals[loose])
+        stray |= beside & flat
+        facing = _facing(points[loose], normals[loose], skin) * len(loose) / len(points)
     outside = points[~inside]
     away = skin.tree.query(outside[thin(len(outside), SCAN_SAMPLES)])[0]
     square = (counts[places[stray]] * gaps[stray] ** 2).sum() + (away**2).sum() * len(outside) / max(len(away), 1)
     count = len(outside) + int(counts[places[stray]].sum())
     farthest = max(gaps[stray].max(initial=0.0), away.max(initial=0.0))
-    return Stray(count, float(farthest), flat, float(square) / len(points))
+    beyond = counts[places[gaps > WORN]].sum() / len(points)
+    return Stray(count, float(farthest), flat, float(square) / len(points), facing, float(beyond))
+
+
+def _facing(points: np.ndarray, normals: np.ndarray, skin: Skin) -> float:
+    """The share of points ``(M, 3)`` whose normals point at the skin nearest to them."""
+    some = thin(len(points), SCAN_SAMPLES // 4)
+    gaps, near = skin.tree.query(points[some])
+    cosines = ((points[some] - skin.places[near]) * normals[some]).sum(axis=1) / np.maximum(gaps, 1e-9)
+    return float((cosines < -SAME_SIDE).mean())
 
 
 def is_flat(points: np.ndarray, normals: np.ndarray) -> bool:
@@ -283,30 +299,36 @@ def suggest_hint(
     places = skin.places[skin.tight]
     low, high = np.quantile(scan.points, [0.002, 0.998], axis=0)
     before = best = scan.distance(places)
-    found = ("", np.eye(3), 1.0, None)
-    for name, linear in _mistakes():
-        size = float(np.linalg.norm(high - low) / np.linalg.norm(np.ptp(skin.places @ linear, axis=0)))
-        for scale in (1.0, size) if abs(size - 1) > LARGER else (1.0,):
-            moved = scale * places @ linear  # the inverse of an orthogonal matrix is its transpose: body to scan
-            whole = scale * skin.places @ linear
+    name, linear, scale, step = "", np.eye(3), 1.0, np.zeros(3)
+    for words, matrix in _mistakes():
+        size = float(np.linalg.norm(high - low) / np.linalg.norm(np.ptp(skin.places @ matrix, axis=0)))
+        for factor in (1.0, size) if abs(size - 1) > LARGER else (1.0,):
+            moved = factor * places @ matrix  # the inverse of an orthogonal matrix is its transpose: body to scan
+            whole = factor * skin.places @ matrix
             shift = (low + high - whole.min(axis=0) - whole.max(axis=0)) / 2
-            for step in (np.zeros(3), shift) if scale == 1 else (shift,):
-                distance = scan.distance(moved + step)
-                if distance < best - (0.002 if step.any() else 0):
-                    best, found = distance, (name, linear, scale, step)
-    name, linear, scale, step = found
+            for move in (np.zeros(3), shift) if factor == 1 else (shift,):
+                distance = scan.distance(moved + move)
+                if distance < best - (SIMPLER if move.any() else ROUNDED):
+                    best, name, linear, scale, step = distance, words, matrix, factor, move
     middle, start = places.mean(axis=0), scale * linear.T
-    moved = np.zeros(3) if step is None else start @ middle + step - middle
+    moved = start @ middle + step - middle
     fit = fit_similarity(scan, skin, 1.0, start, moved)
+    improved = fit.after < best
     scale = fit.scale if abs(fit.scale - 1) > SCALE_SHOWN else 1.0
-    at = middle + fit.shift if fit.after < best else middle + moved
-    back = middle - linear @ at / scale
-    corrected = ScanSamples(points @ linear.T / scale + back, normals @ linear.T)
-    overlap = corrected.overlap(skin)
-    tight_enough = tight is None or min(fit.after, best) < ALIGNED + scan.grain
-    if min(fit.after, best) > CURE * before or not tight_enough or overlap.buried > CURED_BURIED:
-        return ""
-    if tight is None and overlap.covered < CURED:
+    if improved and fit.degrees > TURN_SHOWN:
+        linear = linear @ Rotation.from_rotvec(fit.turn).as_matrix().T
+        name = (
+            _turn_words(linear)
+            if np.linalg.det(linear) > 0
+            else f"{name}, then turning it by {fit.degrees:.0f} degrees"
+        )
+    back = middle - linear @ (middle + (fit.shift if improved else moved)) / scale
+    after, overlap = (
+        min(fit.after, best),
+        ScanSamples(points @ linear.T / scale + back, normals @ linear.T).overlap(skin),
+    )
+    cured = overlap.covered >= CURED if tight is None else after < ALIGNED + scan.grain
+    if after > CURE * before or not cured or overlap.buried > CURED_BURIED:
         return ""
     parts = [name] if name else []
     if scale != 1:
@@ -314,6 +336,12 @@ def suggest_hint(
     if np.abs(back).max() > 0.02:
         parts.append(f"{'m' if parts else 'M'}oving it by {show_vector(back)} m")
     return f"{' and '.join(parts)} would lay it over the body; or do the reverse to the fit." if parts else ""
+
+
+def _turn_words(linear: np.ndarray) -> str:
+    turn = Rotation.from_matrix(linear).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    return f"Turning the scan by {np.degrees(angle):.0f} degrees about {show_vector(turn / angle, 1)}"
 
 
 def _mistakes() -> Iterator[tuple[str, np.ndarray]]:
@@ -326,6 +354,14 @@ def _mistakes() -> Iterator[tuple[str, np.ndarray]]:
     for axis, row in zip("xyz", np.eye(3)):
         yield f"Mirroring the scan ({axis} to -{axis})", np.diag(1 - 2 * row)
     yield "Swapping y and z of the scan", np.eye(3)[[0, 2, 1]]
+    for axis, angles in (("x", (-25, 25)), ("y", (-135, -45, 45, 135)), ("z", (-25, 25))):
+        for angle in angles:
+            linear = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
+            yield _turn_words(linear), linear
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            axes = ", ".join(f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for axis, sign in zip(order, signs))
+            yield f"Taking ({axes}) for (x, y, z) of the scan", np.diag(signs) @ np.eye(3)[list(order)]
 
 
 def show_vector(steps: np.ndarray, digits: int = 2) -> str:

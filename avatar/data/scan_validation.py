@@ -14,6 +14,7 @@ from avatar.data.alignment import (
     INSIDE_OUT,
     NEAR,
     UNORIENTED,
+    WORN,
     Overlap,
     ScanSamples,
     Similarity,
@@ -40,11 +41,15 @@ WOUND, DOUBTFUL_WOUND = 0.7, 0.9  # shares of faces wound as their normals say; 
 # At head, hands and feet valid scans lie within 1.4 cm on average (2.1 cm with hair and shoes added), and have 0.1%
 # (2.7%) of another size, 0.3 (0.8) degrees of turn and 0.2 cm (0.8 cm) of shift. Beyond the first number is a doubt,
 # beyond the second an error.
-TURN, SHIFT = (4.0, 10.0), (0.03, 0.06)  # degrees, metres
-APART = (0.025, 0.10)  # metres of mean distance
-ROUGH = 0.005  # metres that the scan lies off an even layer there: 1.6 mm, and 4 mm and more with 1 cm of noise
+TURN, SHIFT = (4.0, 10.0), (0.03, 0.045)  # degrees, metres
+APART = (0.023, 0.10)  # metres of mean distance
+NEARBY = 0.05  # metres of it from which on scale, turn and shift are searched farther than they can be fitted
+ROUGH = 0.004  # metres that the scan lies off an even layer there: 1.6 mm, and 4 mm and more with 1 cm of noise
 MAJORITY, NEARLY_ALL = 0.5, 0.8  # shares of the places there on the scan: a gown may hide the feet
 STRAY, STRAY_SPREAD = 2e-3, 2e-5  # share of points, or square metres that they add to a Chamfer distance: refused
+FACING, BEYOND = (0.02, 0.04), 0.005  # shares of the scan; 0.017 of a wide dress face the body, none is beyond
+REPEATED = 0.02  # share of points at one place
+NOISY = 0.15  # share of the scan deep inside the body that noise explains
 NOISE = "That is noise, or a poor fit."
 
 
@@ -105,37 +110,62 @@ class _PlacedScan:
     def check_stray(self) -> dict[str, str]:
         """Refuses a scan with much that is not the person; little of it is a doubt."""
         stray, total = find_stray(self.scan.points, self.scan.normals, self.skin), len(self.scan.points)
-        if not stray.count:
-            return {}
-        share, shape = stray.count / total, " on a plane" if stray.flat else ""
+        share, alone = stray.count / total, "scan: expected the person alone"
         problem = (
-            f"scan: expected the person alone, {stray.count} of {total} points ({share:.2%}) lie apart from the body"
-            f"{shape}, up to {stray.farthest:.3g} m from it."
+            f"{alone}, {stray.count} of {total} points ({share:.2%}) lie apart from the body"
+            f"{' on a plane' if stray.flat else ''}, up to {stray.farthest:.3g} m from it."
         )
         if stray.flat:
             hint = "That looks like a floor or wall: cut it off."
-        elif share > 0.05:
+        elif share > 0.02:
             hint = f"That looks like another person or furniture: keep what lies within {FAR:.1f} m of the body."
         else:
             hint = "Those look like stray points: remove small pieces that are not joined to the person."
-        if share < STRAY and stray.spread < STRAY_SPREAD:
-            return {"stray": f"{problem} {hint}"}
-        raise DataError(self.path, problem, hint)
+        if share >= STRAY or stray.spread >= STRAY_SPREAD:
+            raise DataError(self.path, problem, hint)
+        facing = f"{alone}, {stray.facing:.1%} of the scan lie beside the body and look at it."
+        other = "That looks like another person or furniture touching this one: cut it off."
+        if stray.facing > FACING[1]:
+            raise DataError(self.path, facing, other)
+        doubts = {"stray": f"{problem} {hint}"} if stray.count else {}
+        if stray.facing > FACING[0]:
+            doubts["facing"] = f"{facing} {other}"
+        if stray.beyond > BEYOND:
+            width = f"{alone}, {stray.beyond:.1%} of the scan lie more than {WORN:.2f} m from the body"
+            doubts["wide"] = f"{width}. Is something else than cloth among it?"
+        return doubts | self._check_repeats()
+
+    def _check_repeats(self) -> dict[str, str]:
+        """Refuses scans with many points at one place, such as pixels without depth; few at the origin are a doubt."""
+        points = self.scan.points
+        some = np.ascontiguousarray(points[thin(len(points), 1000)])
+        repeated = np.unique(some.view(np.dtype((np.void, some.itemsize * 3))), return_counts=True)[1].max() / len(some)
+        zeros = int((points == 0).all(axis=1).sum())
+        share = max(float(repeated), zeros / len(points))
+        hint = "Those look like pixels without depth: remove them."
+        if share > REPEATED:
+            problem = f"scan: expected points of a surface, {share:.0%} of them lie at one and the same place."
+            raise DataError(self.path, problem, hint)
+        return {"zeros": f"scan: {zeros} points lie exactly at the origin. {hint}"} if zeros > 1 else {}
 
     def check_place(self) -> dict[str, str]:
         """Refuses a scan that does not lie over its body, with the move, turn or scale that would lay it there."""
         overlap, fit, grain, known = self.overlap, self.fit, self.samples.grain, self.tight is not None
         self._check_far_off()
         fitted = known and fit.share > MAJORITY
-        if known and fit.share > NEARLY_ALL and (words := _misfit(fit, 1, grain)):
+        precise = known and fit.share > NEARLY_ALL and fit.after < APART[0] + grain
+        words = _misfit(fit, 1, grain) if precise else ()
+        if words and fit.before < NEARBY + grain:
             raise DataError(self.path, f"{self._problem} There {words[0]}", words[1])
         apart = known and fit.before > APART[0] + grain
-        if self._misplaced or (apart and (not fitted or _misfit(fit, 0, grain))):
+        if words or self._misplaced or (apart and not precise and (not fitted or _misfit(fit, 0, grain))):
             hint = suggest_hint(self.scan.points, self.scan.normals, self.body, self.template.faces.numpy(), self.tight)
+            if words and not hint:
+                raise DataError(self.path, f"{self._problem} There {words[0]}", words[1])
             if hint or self._misplaced or fit.before > APART[1] + grain:
-                rough = fitted and not apart and fit.roughness > ROUGH + grain
+                rough = fitted and not apart and fit.roughness > ROUGH + grain and overlap.buried < NOISY
                 raise DataError(self.path, self._problem, hint or (NOISE if rough else self._no_correction()))
-        if fitted and (words := _misfit(fit, 0, grain)):
+        if precise and (words := _misfit(fit, 0, grain)):
             return {"fit": f"{self._problem} There {words[0]} {words[1]}"}
         if apart or overlap.covered < DOUBTFUL_COVERED:
             return {"apart": f"{self._problem} Is the fit right, and nobody's head, hand or foot missing or covered?"}
@@ -189,7 +219,7 @@ def _misfit(fit: Similarity, level: int, grain: float) -> tuple[str, str] | tupl
     if fit.degrees > TURN[level] + np.degrees(grain):
         axis = show_vector(fit.turn / np.linalg.norm(fit.turn), 1)
         parts.append(f"is turned by {fit.degrees:.0f} degrees about {axis}")
-    if np.linalg.norm(fit.shift) > SHIFT[level] + grain:
+    if np.linalg.norm(fit.shift) > SHIFT[level] + 2 * grain:
         parts.append(f"lies {show_vector(fit.shift)} m from it")
     return (f"it {' and '.join(parts)}.", "Undo that to the scan, or do it to the fit.") if parts else ()
 

@@ -12,13 +12,13 @@ from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.packed import border_positions
 from avatar.checks import AvatarError, DataError, check_finite
 from avatar.data.alignment import show_vector, thin
-from avatar.geometry.units import METRES, USUAL, possible_units
 from avatar.records import Template
 
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
 LONG_EDGE, SAME_WAY = 0.15, 0.05  # median edge to size of a body; share of directed edges that two faces have
-UNITS = {"cm": "centimetres", "mm": "millimetres", "in": "inches"}
+UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048, "decimetres": 0.1}  # metres
+UNITS["kilometres, or metres scaled twice"] = 1000.0
 LIKE = 1.5  # times larger or smaller than a unit would make it, and still taken for it
 DIFFERENT_SIZE = (0.04, 0.08)  # share that a body or scan is larger or smaller than it should be: doubtful, refused
 ALONG = 0.7  # cosine to an axis from which on a direction runs along it
@@ -51,8 +51,7 @@ def check_template(template: Template, path: Path) -> None:
         _check_axes(template, path)
     if not low <= extents[1] <= high:
         problem = f"vertices: expected a body {low} to {high} m high, got {extents[1]:.4g} along y."
-        height = float(extents[1])
-        raise DataError(path, problem, _unit_hint(possible_units(height), height / USUAL))
+        raise DataError(path, problem, _unit_hint(float(extents[1]), low, high))
 
 
 def _check_axes(template: Template, path: Path) -> None:
@@ -140,9 +139,9 @@ def _ancestors(template: Template, joint: int) -> list[str]:
 
 def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: Callable[[np.ndarray], bool]) -> str:
     """What would lay joints ``(J, 3)`` on the borders of their weights ``(J, 3)``, so that they ``fit``."""
-    for unit, name in UNITS.items():
-        if fit(joints * METRES[unit]):
-            return f"They look like {name}: divide joints by {1 / METRES[unit]:.5g}."
+    for unit, metres in UNITS.items():
+        if fit(joints * metres):
+            return f"They look like {unit}: divide joints by {1 / metres:.5g}."
     other = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in names]
     if set(other) == set(names) and fit(joints[[names.index(name) for name in other]]):
         return "The weights of left and right look swapped: exchange their columns, or the joints' names."
@@ -179,23 +178,20 @@ def check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, pat
     low, high = SIZE_RATIO
     if not low <= size / expected <= high:
         problem = f"{what}: expected about {expected:.2f} m across as {words}, got {size:.4g}."
-        ratio = size / expected
-        near = [unit for unit in UNITS if 1 / LIKE < ratio * METRES[unit] < LIKE]
-        raise DataError(path, problem, _unit_hint(near, ratio))
+        raise DataError(path, problem, _unit_hint(size, expected / LIKE, expected * LIKE))
 
 
-def _unit_hint(units: Sequence[str], ratio: float) -> str:
-    """What to do with positions in one of ``units``, ``ratio`` times as large as in metres."""
-    factors = {unit: 1 / METRES[unit] for unit in units}
-    if factors:
-        looks = " or ".join(UNITS[unit] for unit in factors)
-        factor = next(iter(factors.values()))
-        return (
-            f"That looks like {looks}: divide positions and translations by {factor:.5g} (multiply by {1 / factor:g})."
-        )
-    if 1 / LIKE < ratio * 1000 < LIKE:
-        return "That looks like kilometres, or metres scaled twice: multiply positions and translations by 1000."
-    return "Positions must be in metres with y up, and a scan must hold nothing but the person."
+def _unit_hint(size: float, low: float, high: float) -> str:
+    """What to do with positions of a ``size`` that should be ``low`` to ``high`` metres."""
+    usual = np.sqrt(low * high)
+    found = [unit for unit, metres in UNITS.items() if low <= size * metres <= high]
+    if not found:
+        return "Positions must be in metres with y up, and a scan must hold nothing but the person."
+    found.sort(key=lambda unit: abs(np.log(size * UNITS[unit] / usual)))
+    metres = UNITS[found[0]]
+    todo = f"divide positions and translations by {1 / metres:.5g} (multiply by {metres:g})"
+    todo = todo if metres < 1 else f"multiply positions and translations by {metres:g}"
+    return f"That looks like {' or '.join(found)}: {todo}."
 
 
 def check_posed(

@@ -123,7 +123,7 @@ FITS = [
     (
         "body moved by 5 cm",
         REFUSED,
-        r"Moving it by \(0\.05, ",
+        r"lies \(-0\.05, .*m from it|Moving it by \(0\.05, ",
         lambda f, base: lacking("pose", "translation")(
             changed(body_verts=lambda v: v + np.float32([0.05, 0, 0]))(f, base), base
         ),

@@ -88,6 +88,11 @@ def strays(count: int, near: float, far: float) -> Callable:
     return make
 
 
+def at_origin(count: int) -> Callable:
+    """Points at (0, 0, 0)."""
+    return lambda scan, rng: (np.zeros((count, 3)), np.tile([0.0, 0.0, 1.0], (count, 1)))
+
+
 def box(scan: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A chair beside the person: a box of 40 cm."""
     side = rng.integers(3, size=1500)
@@ -159,7 +164,7 @@ SCANS = [
     (
         "0.7 times as large",
         REFUSED,
-        r"0\.70 times the body's size.*Divide its positions by 0\.70",
+        r"Dividing its positions by 0\.70",
         moved(0.7 * np.eye(3)),
     ),
     (
@@ -179,9 +184,19 @@ SCANS = [
         r"lies \(0\.03, .*m from it|lies \(0\.04, .*m from it",
         moved(np.eye(3), (0.035, 0, 0)),
     ),
-    ("moved by 5 cm to the side", REFUSED, r"Moving it by \(-0\.05, ", moved(np.eye(3), (0.05, 0, 0))),
-    ("moved by 5 cm up", REFUSED, r"Moving it by \(-?0\.00, -0\.05, ", moved(np.eye(3), (0, 0.05, 0))),
-    ("moved by 10 cm", REFUSED, r"lies \(0\.10, .*m from it", moved(np.eye(3), (0.1, 0, 0))),
+    (
+        "moved by 5 cm to the side",
+        REFUSED,
+        r"lies \(0\.05, .*m from it|Moving it by \(-0\.05, ",
+        moved(np.eye(3), (0.05, 0, 0)),
+    ),
+    (
+        "moved by 5 cm up",
+        REFUSED,
+        r"lies \(-?0\.00, 0\.05, .*m from it|Moving it by \(-?0\.00, -0\.05, ",
+        moved(np.eye(3), (0, 0.05, 0)),
+    ),
+    ("moved by 10 cm", REFUSED, r"Moving it by \(-0\.10", moved(np.eye(3), (0.1, 0, 0))),
     ("moved by 50 cm", REFUSED, r"Moving it by \(-0\.(49|5)", moved(np.eye(3), (0.5, 0, 0))),
     ("in another room", REFUSED, r"Moving it by \(-3\.\d\d, .*, -2\.\d\d\)", moved(np.eye(3), (3, 0, 2))),
     ("moved by a translation in millimetres", REFUSED, "is the translation in metres", moved(np.eye(3), FAR_PLACE)),
@@ -198,7 +213,7 @@ SCANS = [
         (
             f"turned by 20 degrees about {axis}",
             REFUSED,
-            r"turned by (19|20) degrees about|another frame",
+            r"[Tt]urn(ed|ing the scan) by (19|20) degrees about",
             moved(turn(axis, 20), about=True),
         )
         for axis in "xyz"
@@ -229,6 +244,13 @@ SCANS = [
     ),
     ("mirrored", REFUSED, r"Mirroring the scan \(x to -x\)", moved(np.diag([-1, 1, 1]))),
     ("mirrored, y and z swapped", REFUSED, r"Swapping y and z of the scan|Mirroring", moved(np.eye(3)[[0, 2, 1]])),
+    ("in feet", REFUSED, r"feet: divide .* by 3\.2808", moved(np.eye(3) / 0.3048)),
+    ("1.2 times as wide", WARNED, "head, hands and feet lie .*Is the fit right", moved(np.diag([1.2, 1, 1]))),
+    ("1.15 times as high", WARNED, r"1\.1\d times the body's size|Is the fit right", moved(np.diag([1, 1.15, 1]))),
+    ("moved by 15 cm down", REFUSED, r"Moving it by \(-?0\.00, 0\.15", moved(np.eye(3), (0, -0.15, 0))),
+    ("turned by 135 degrees about y", REFUSED, "Turning the scan by 135 degrees", moved(turn("y", 135), about=True)),
+    ("with x, y and z in another order", REFUSED, r"Taking \(z, x, y\) for \(x, y, z\)", moved(np.eye(3)[[1, 2, 0]])),
+    ("with its columns sorted", REFUSED, "another frame or person", changed(scan_pc=lambda p: np.sort(p, axis=0))),
     ("of another frame", REFUSED, "is the fit of another frame or person", of_frame("train/walk.00002.npz", *ON)),
     ("of a taller person", REFUSED, r"1\.10 times .*another person's shape", moved(1.1 * np.eye(3), about=True)),
     (
@@ -264,6 +286,16 @@ SCANS = [
     ("with a wall behind", REFUSED, "lie apart from the body on a plane.*floor or wall", added(plane(2, "wall"))),
     ("with a second person beside", REFUSED, "50.00% lie apart|another person or furniture", beside(1.2)),
     ("with a second person 5 m away", REFUSED, "another person or furniture", beside(5.0)),
+    ("with a second person at 50 cm", REFUSED, "beside the body and look at it.*touching", beside(0.5)),
+    ("with a second person at 80 cm", REFUSED, "another person or furniture", beside(0.8)),
+    ("with a floor of 60 cm", REFUSED, "lie apart from the body on a plane.*floor or wall", added(plane(0.6, "floor"))),
+    (
+        "with pixels without depth",
+        REFUSED,
+        "5% of them lie at one and the same place.*without depth",
+        added(at_origin(210)),
+    ),
+    ("with 3 points at the origin", WARNED, "3 points lie exactly at the origin", added(at_origin(3))),
     ("with a box beside", REFUSED, "another person or furniture", added(box)),
     ("with 5 stray points at 5 m", REFUSED, r"5 of 4005 points .*stray points", added(strays(5, 3, 6))),
     ("with 1 stray point at 100 m", REFUSED, r"1 of 4001 points .*stray points", added(strays(1, 80, 110))),
