@@ -301,10 +301,10 @@ def suggest_hint(
     before = best = scan.distance(places)
     name, linear, scale, step = "", np.eye(3), 1.0, np.zeros(3)
     for words, matrix in _mistakes():
-        size = float(np.linalg.norm(high - low) / np.linalg.norm(np.ptp(skin.places @ matrix, axis=0)))
+        size = float(np.linalg.norm(high - low) / np.linalg.norm(np.ptp(skin.covered @ matrix, axis=0)))
         for factor in (1.0, size) if abs(size - 1) > LARGER else (1.0,):
             moved = factor * places @ matrix  # the inverse of an orthogonal matrix is its transpose: body to scan
-            whole = factor * skin.places @ matrix
+            whole = factor * skin.covered @ matrix
             shift = (low + high - whole.min(axis=0) - whole.max(axis=0)) / 2
             for move in (np.zeros(3), shift) if factor == 1 else (shift,):
                 distance = scan.distance(moved + move)

@@ -125,10 +125,10 @@ class _PlacedScan:
             raise DataError(self.path, problem, hint)
         facing = f"{alone}, {stray.facing:.1%} of the scan lie beside the body and look at it."
         other = "That looks like another person or furniture touching this one: cut it off."
-        if stray.facing > FACING[1]:
+        if stray.facing > FACING[1] + self.samples.grain:
             raise DataError(self.path, facing, other)
         doubts = {"stray": f"{problem} {hint}"} if stray.count else {}
-        if stray.facing > FACING[0]:
+        if stray.facing > FACING[0] + self.samples.grain:
             doubts["facing"] = f"{facing} {other}"
         if stray.beyond > BEYOND:
             width = f"{alone}, {stray.beyond:.1%} of the scan lie more than {WORN:.2f} m from the body"
