@@ -43,12 +43,13 @@ FLAT, FLAT_NORMALS, WIDE = 0.02, 0.9, 0.4  # metres thick, share of squared norm
 class Skin:
     """Places on a posed body, evenly by area: ``places (S, 3)`` metres, unit ``normals (S, 3)``, float64.
 
-    ``tight (S,)`` says where cloth lies close: head, hands and feet; everywhere, for a body whose joints are unknown.
+    ``tight (S,)`` says where cloth lies close: head, hands and feet; everywhere, where these are not ``known``.
     """
 
     places: np.ndarray
     normals: np.ndarray
     tight: np.ndarray
+    known: bool = True
 
     @cached_property
     def tree(self) -> Tree:
@@ -71,9 +72,10 @@ def sample_skin(vertices: np.ndarray, faces: np.ndarray, tight: np.ndarray | Non
     faces = faces[picked.clip(max=len(faces) - 1)]
     corners = vertices[faces].astype(np.float64)
     crosses = _crosses(corners.reshape(-1, 3), np.arange(3 * SKIN_SAMPLES).reshape(-1, 3))
-    close = np.ones(SKIN_SAMPLES, bool) if tight is None else tight[faces].mean(axis=1) > TIGHT
+    close = np.zeros(SKIN_SAMPLES, bool) if tight is None else tight[faces].mean(axis=1) > TIGHT
+    known = int(close.sum()) >= FEWEST_TIGHT
     lengths = np.linalg.norm(crosses, axis=1, keepdims=True)
-    return Skin(corners.mean(axis=1), crosses / np.maximum(lengths, 1e-20), close)
+    return Skin(corners.mean(axis=1), crosses / np.maximum(lengths, 1e-20), close | (not known), known)
 
 
 def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -327,7 +329,7 @@ def suggest_hint(
         min(fit.after, best),
         ScanSamples(points @ linear.T / scale + back, normals @ linear.T).overlap(skin),
     )
-    cured = overlap.covered >= CURED if tight is None else after < ALIGNED + scan.grain
+    cured = overlap.covered >= CURED if not skin.known else after < ALIGNED + scan.grain
     if after > CURE * before or not cured or overlap.buried > CURED_BURIED:
         return ""
     parts = [name] if name else []

@@ -150,7 +150,7 @@ class _PlacedScan:
 
     def check_place(self) -> dict[str, str]:
         """Refuses a scan that does not lie over its body, with the move, turn or scale that would lay it there."""
-        overlap, fit, grain, known = self.overlap, self.fit, self.samples.grain, self.tight is not None
+        overlap, fit, grain, known = self.overlap, self.fit, self.samples.grain, self.skin.known
         self._check_far_off()
         fitted = known and fit.share > MAJORITY
         precise = known and fit.share > NEARLY_ALL and fit.after < APART[0] + grain
@@ -177,7 +177,7 @@ class _PlacedScan:
     @property
     def _misplaced(self) -> bool:
         """Whether so much of the body is bare, or of the scan deep inside, that one is not the other's."""
-        overlap, least = self.overlap, LEAST_COVERED if self.tight is None else LEAST_OF_PERSON
+        overlap, least = self.overlap, LEAST_OF_PERSON if self.skin.known else LEAST_COVERED
         inward = INSIDE_OUT <= overlap.outward < DOUBTFUL_OUTWARD
         doubtful = overlap.covered < DOUBTFUL_COVERED and (overlap.buried > DOUBTFUL_BURIED or inward)
         return overlap.covered < least or overlap.buried > MOST_BURIED or doubtful
@@ -185,7 +185,7 @@ class _PlacedScan:
     @property
     def _problem(self) -> str:
         """How the scan lies, in words."""
-        reached = "" if self.tight is None else f" head, hands and feet lie {100 * self.fit.before:.1f} cm from it"
+        reached = "" if not self.skin.known else f" head, hands and feet lie {100 * self.fit.before:.1f} cm from it"
         return (
             f"scan: expected it over its body, {self.overlap.covered:.0%} of the body has a scan point within "
             f"{NEAR:.2f} m,{reached} and {self.overlap.buried:.0%} of the scan lies deep inside."

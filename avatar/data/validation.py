@@ -16,6 +16,7 @@ from avatar.records import Template
 
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
+ROUNDED = 5e-4  # metres that a body's vertices may be rounded by
 LONG_EDGE, SAME_WAY = 0.15, 0.05  # median edge to size of a body; share of directed edges that two faces have
 UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048, "decimetres": 0.1}  # metres
 UNITS["kilometres, or metres scaled twice"] = 1000.0
@@ -23,6 +24,7 @@ LIKE = 1.5  # times larger or smaller than a unit would make it, and still taken
 DIFFERENT_SIZE = (0.04, 0.08)  # share that a body or scan is larger or smaller than it should be: doubtful, refused
 ALONG = 0.7  # cosine to an axis from which on a direction runs along it
 MOST_TURN = 2 * np.pi + 0.1  # radians; no joint turns farther, and degrees soon exceed it
+FOLLOWED = 0.1  # skinning weight of a joint's own vertices
 JOINT_GAP, JOINTS_GAP = 0.25, 0.12  # metres from a joint to its weights' border: one, median (open body: 0.13, 0.04)
 APART, SHARE = 0.05, 0.99  # metres between posed bodies at that share of vertices: margin for lost blendshapes
 EDGE_ERROR = 0.18  # of the edges' length: 0.03 to 0.10 where right (sample outfits), 0.27 and more for no rotation
@@ -33,7 +35,11 @@ TURNS = {  # where it should lie and where it does: what corrects it
     ("+y", "-z"): "Turn body and scans by 90 degrees about x: (x, y, z) to (x, -z, y).",
     ("+y", "+x"): "Turn body and scans by 90 degrees about z: (x, y, z) to (-y, x, z).",
     ("+y", "-x"): "Turn body and scans by -90 degrees about z: (x, y, z) to (y, -x, z).",
-    ("+x", "-x"): "Either it faces -z (turn body and scans by 180 degrees about y), or it is mirrored (negate x).",
+    (
+        "+x",
+        "-x",
+    ): "It faces -z (turn body and scans by 180 degrees about y), is mirrored (negate x), or joint_names have "
+    "left and right exchanged.",
     ("+x", "+z"): "Turn body and scans by 90 degrees about y: (x, y, z) to (z, y, -x).",
     ("+x", "-z"): "Turn body and scans by -90 degrees about y: (x, y, z) to (-z, y, x).",
 }
@@ -46,6 +52,10 @@ def check_template(template: Template, path: Path) -> None:
     """
     extents = np.ptp(template.vertices.numpy(), axis=0)
     low, high = BODY_HEIGHT
+    middle = float(template.vertices.median(dim=0).values.abs().max())
+    if (step := float(np.spacing(np.float32(middle)))) > ROUNDED:
+        problem = f"vertices: expected a body near the origin, float32 rounds those at {middle:.4g} m to {step:.2g} m."
+        raise DataError(path, problem, "Move vertices, joints and frames to the origin.")
     _check_edges(template, path)
     if low <= extents.max() <= high:
         _check_axes(template, path)
@@ -56,11 +66,18 @@ def check_template(template: Template, path: Path) -> None:
 
 def _check_axes(template: Template, path: Path) -> None:
     """Refuses a body whose joints, or whose shape where they are unknown, do not stand upright facing +z."""
+    plain = {name.strip().lower().replace(" ", "_").replace("-", "_"): name for name in template.joint_names}
+    if set(SMPL_JOINTS) <= plain.keys() and (other := [joint for joint in SMPL_JOINTS if plain[joint] != joint]):
+        problem = f"joint_names: expected SMPL's, such as {other[0]!r}, got {plain[other[0]]!r}."
+        raise DataError(path, problem, "Write them in lower case with underscores, without blanks.")
+    width, height, depth = np.ptp(template.vertices.numpy(), axis=0)
+    upright = height > 2 * depth and height > width / 2
     places = dict(zip(template.joint_names, template.joints.numpy().astype(np.float64)))
     for start, end, wanted in AXES:
         if start in places and end in places and (found := _axis_along(places[end] - places[start])) != wanted:
             problem = f"joints: expected {end} towards {wanted} from {start}, it lies towards {found or 'no axis'}."
             hint = TURNS.get((wanted, found), "Turn body and scans so that y is up and the body faces +z.")
+            hint += " Or joint_names are in another order than joints." if wanted == "+y" and upright else ""
             raise DataError(path, problem, hint)
     vertices, faces = template.vertices.double(), template.faces
     a, b, c = (vertices[faces[:, corner]] - vertices.mean(dim=0) for corner in range(3))
@@ -68,7 +85,6 @@ def _check_axes(template: Template, path: Path) -> None:
         problem = f"faces: expected them counter-clockwise from outside, they enclose {volume:.3f} m³: wound inward."
         hint = "Swap two columns of the faces; or, if the body is mirrored as well, negate x of the vertices instead."
         raise DataError(path, problem, hint)
-    _, height, depth = np.ptp(template.vertices.numpy(), axis=0)
     if height < depth / 2:
         problem = f"vertices: expected a body that stands along y, it is {height:.2f} m high and {depth:.2f} m deep."
         raise DataError(path, problem, TURNS["+y", "+z"])
@@ -83,6 +99,9 @@ def _check_edges(template: Template, path: Path) -> None:
     if length > LONG_EDGE * size:
         problem = f"faces: expected edges that are short against the body, half of them are {length / size:.0%} of it."
         raise DataError(path, problem, "Are the faces those of these vertices, in their order?")
+    if (repeated := len(faces) - len(np.unique(np.sort(faces, axis=1), axis=0))) > SAME_WAY * len(faces):
+        problem = f"faces: expected each once, {repeated} of {len(faces)} are there once more."
+        raise DataError(path, problem, "Leave them out.")
     _, counts = np.unique(starts * len(vertices) + ends, return_counts=True)
     if (share := float((counts > 1).mean())) > SAME_WAY:
         problem = f"faces: expected neighbours to run along their edge either way, on {share:.0%} of edges they do not."
@@ -106,6 +125,12 @@ def check_joints(template: Template, path: Path) -> None:
         if joint in names and parent in names and parent not in (above := _ancestors(template, names.index(joint))):
             problem = f"parents: expected {parent} above {joint}, there are {', '.join(above) or 'no joints'}."
             raise DataError(path, problem, "Are parents in the order of the joints' names?")
+    strongest = template.weights.amax(dim=0)
+    moved = [joint for joint in SMPL_JOINTS if joint in names]
+    still = [joint for joint in moved if strongest[names.index(joint)] < FOLLOWED]
+    if len(still) > len(moved) / 2:
+        problem = f"weights: expected vertices that follow each joint, none follows {', '.join(still[:4])}."
+        raise DataError(path, problem, "Are the columns of weights in the order of the joints, and those of this body?")
     vertices = template.vertices.numpy()
     borders = border_positions(vertices, template.weights.numpy(), template.parents)
     judged = np.isfinite(borders[:, 0]) & (np.arange(len(borders)) > 0)

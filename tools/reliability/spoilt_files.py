@@ -28,6 +28,12 @@ def exchanged(poses: np.ndarray) -> np.ndarray:
     return poses[:, swapped() + list(range(22, 52))]
 
 
+def with_jump(poses: np.ndarray) -> np.ndarray:
+    """Poses of which one is another."""
+    poses[30, 1:22] = np.random.default_rng(0).normal(size=(21, 3))
+    return poses
+
+
 MOTIONS = [
     ("as it is", READ, "", lambda motion, base: motion),
     ("y up", REFUSED, "upright along y .*up=y", lambda m, base: m | rotated_motion(m, turn("x", -90))),
@@ -58,6 +64,15 @@ MOTIONS = [
         "turned up without the poses",
         lambda m, base: m | {"trans": m["trans"] @ turn("x", -90).T},
     ),
+    (
+        "translations in feet",
+        WARNED,
+        "feet slide: .*multiplied by 0.3",
+        lambda m, base: m | {"trans": m["trans"] / 0.3048},
+    ),
+    ("translations in inches", REFUSED, "units=in", lambda m, base: m | {"trans": m["trans"] / 0.0254}),
+    ("frames in another order", WARNED, "are frames in their order", motion_pose(np.random.default_rng(0).permutation)),
+    ("a frame of another motion", WARNED, "jump by up to .* after frame 29", motion_pose(with_jump)),
     ("left and right exchanged", WARNED, "left", motion_pose(exchanged)),
     (
         "joints in another order",
