@@ -37,7 +37,7 @@ FAR_OFF = 10.0  # metres between the middles of scan and body that only a transl
 LEAST_COVERED, LEAST_OF_PERSON, MOST_BURIED = 0.6, 0.7, 0.05  # each alone is a misfit
 DOUBTFUL_COVERED, DOUBTFUL_BURIED, DOUBTFUL_OUTWARD = 0.85, 0.01, 0.8  # the first with one of the others
 ACROSS = 0.5  # mean cosine between normals of scan and skin; 0.4 for normals turned by 90 degrees
-WOUND, DOUBTFUL_WOUND = 0.7, 0.9  # shares of faces wound as their normals say; 0.99 in raw meshes
+WOUND, CLEARLY = (0.1, 0.25), 0.5  # shares of faces wound against their normals by that cosine: doubtful, refused
 # At head, hands and feet valid scans lie within 1.4 cm on average (2.1 cm with hair and shoes added), and have 0.1%
 # (2.7%) of another size, 0.3 (0.8) degrees of turn and 0.2 cm (0.8 cm) of shift. Beyond the first number is a doubt,
 # beyond the second an error.
@@ -244,16 +244,19 @@ def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> dict[str, str]:
         return doubts
     some = scan.faces[thin(len(scan.faces), 1000)]
     a, b, c = (scan.points[some[:, corner]] for corner in range(3))
-    agree = float(((np.cross(b - a, c - a) * scan.normals[some].sum(axis=1)).sum(axis=1) > 0).mean())
-    if agree < DOUBTFUL_WOUND:
-        problem = f"scan faces: expected them counter-clockwise from outside, {1 - agree:.0%} are not."
+    crosses = np.cross(b - a, c - a)
+    normals = scan.normals[some].sum(axis=1)
+    lengths = np.linalg.norm(crosses, axis=1) * np.linalg.norm(normals, axis=1)
+    against = float(((crosses * normals).sum(axis=1) < -CLEARLY * lengths).mean())
+    if against > WOUND[0]:
+        problem = f"scan faces: expected them counter-clockwise from outside, {against:.0%} are not."
         hint = "Are they this scan's, all wound one way?"
-        if agree < INSIDE_OUT:
+        if against > 1 - INSIDE_OUT:
             hint = (
                 "Either the scan is mirrored (compare left and right with a picture; negate one coordinate of points "
                 "and normals), or its faces are wound inward (swap two of their columns)."
             )
-        if agree < WOUND:
+        if against > WOUND[1]:
             raise DataError(path, problem, hint)
         doubts["faces"] = f"{problem} {hint}"
     return doubts

@@ -148,21 +148,17 @@ def measure_floors(
 ) -> Scores:
     """Scores floors as if they were predictions of so many ``points``, each frame for itself. ``sampling`` is a second
     sampling of the true surface: what a perfect surface scores. Outfits without ``resample`` are sampled from their
-    scans' meshes (variant ``mesh``), or by scan points beyond those that are scored against (variant ``rest``); without
-    either there is no sampling floor, and a warning says so. ``body`` are points spread area-uniformly over the posed
-    bare body.
+    scans' meshes (variant ``mesh``); where these are points there is no sampling floor, and a warning says so. ``body``
+    are points spread area-uniformly over the posed bare body.
     """
     resample, config = getattr(outfit, "resample", None), replace(config, motion=False)
     names = frame_names(outfit, split)
-    source = "" if resample else scan_source(outfit, split, names, config, points)
+    meshes = resample is None and have_meshes(outfit, split, names)
 
     def sampling(frame: Frame) -> Comparison:
         scan, seed = draw_scan(frame, config), config.seed + 1
-        if source == "mesh":
+        if meshes:
             again = sample_body(Mesh(frame.scan.points, frame.scan.faces), points, seed)
-        elif source == "rest":
-            rest = draw_order(frame, config)[config.scan_points :][:points]
-            again = PointCloud(frame.scan.points[rest], frame.scan.normals[rest])
         else:
             sampled = resample(split, frame.name, points, seed=seed)
             again = PointCloud(sampled.points, sampled.normals)
@@ -174,31 +170,26 @@ def measure_floors(
         body = posed_body(outfit, frame)
         return Comparison(sample_body(body, points, config.seed), draw_scan(frame, config), body)
 
-    floors = {"sampling": sampling} if source is not None else {}
+    floors = {"sampling": sampling} if meshes or resample else {}
     contenders = []
     for floor, compare in (floors | {"body": bare}).items():
-        label = Label(floor, variant=source if floor == "sampling" else "", commit=commit, split=split)
+        label = Label(floor, variant="mesh" if meshes and floor == "sampling" else "", commit=commit, split=split)
         memory = remember_points(ledger, floor, outfit, split, config, points=points)
         contenders.append(Contender(label, compare, memory))
     metrics = [metric for metric in find_metrics(config.metrics) if not metric.needs_mesh]
     return score_frames(outfit, split, names, metrics, contenders)
 
 
-def scan_source(outfit: Outfit, split: str, names: Sequence[str], config: ScoreConfig, points: int) -> str | None:
-    """What samples the surface of all frames again where only scans are known: ``mesh``, ``rest`` or None for nothing.
+def have_meshes(outfit: Outfit, split: str, names: Sequence[str]) -> bool:
+    """Whether the scans of all frames are meshes, so that their surface can be sampled again; a warning if not.
 
-    A floor is compared with methods, so it needs as many ``points`` as they predict, and none of those scored against.
+    Halves of a scan would give a floor that methods, which are compared with all of it, lie below.
     """
-    wanted, source = config.scan_points + points, "mesh"
-    for name in names:
-        scan = outfit.load(split, name).scan
-        source = source if scan.faces is not None else "rest"
-        if source == "rest" and (count := len(scan.points)) < wanted:
-            problem = f"no sampling floor: without a mesh it needs scans of {wanted} points, {name} has {count}"
-            hint = "score.scan_points and points may be lowered, or scan_faces added"
-            log.warning("%s: %s (%s).", outfit.name, problem, hint)
-            return None
-    return source
+    without = next((name for name in names if outfit.load(split, name).scan.faces is None), None)
+    if without is not None:
+        reason = f"the scan of {without} has no scan_faces, so that its surface cannot be sampled again"
+        log.warning("%s: there is no sampling floor, and no excess over it: %s.", outfit.name, reason)
+    return without is None
 
 
 def remember_points(
@@ -227,13 +218,8 @@ def draw_scan(frame: Frame, config: ScoreConfig) -> Scan:
     """The scan points a frame is scored against: a random subset, the same for every method."""
     if len(frame.scan.points) <= config.scan_points:
         return frame.scan
-    chosen = np.sort(draw_order(frame, config)[: config.scan_points])
+    chosen = np.sort(frame_generator(frame.name, config.seed).permutation(len(frame.scan.points))[: config.scan_points])
     return Scan(frame.scan.points[chosen], frame.scan.normals[chosen])
-
-
-def draw_order(frame: Frame, config: ScoreConfig) -> np.ndarray:
-    """The random order ``(M,)`` of a frame's scan points, of which the first ``config.scan_points`` are compared."""
-    return frame_generator(frame.name, config.seed).permutation(len(frame.scan.points))
 
 
 def frame_generator(name: str, seed: int) -> np.random.Generator:

@@ -38,17 +38,14 @@ def test_sampling_floor_is_the_spacing_of_random_points(ball):
     assert "jitter" not in values(scores)  # its points are drawn anew each frame
 
 
-def test_scans_alone_have_a_floor_where_they_have_points_to_spare(ball_without_truth, caplog):
-    """It is that of the true surface at the same counts, and no method that has the surface lies below it."""
-    config = replace(CONFIG, scan_points=1500)
-    scores = measure_floors(ball_without_truth, "test", config, 1500).only("method", ["sampling"])
-    assert {(row.variant, row.points) for row in scores.rows} == {("rest", 1500)}
-    assert values(scores)["cd_point"] == pytest.approx(2 * 4 / 1500, rel=0.1)
-    assert caplog.text == ""
+def test_scans_that_are_points_have_no_sampling_floor(ball_without_truth, caplog):
     with caplog.at_level(logging.WARNING):
-        scores = measure_floors(ball_without_truth, "test", config, 1501)
+        scores = measure_floors(ball_without_truth, "test", CONFIG, 3000)
     assert {row.method for row in scores.rows} == {"body"}
-    assert "no sampling floor: without a mesh it needs scans of 3001 points, reach.0007 has 3000" in caplog.text
+    assert (
+        "ball: there is no sampling floor, and no excess over it: the scan of reach.0007 has no scan_faces"
+        in caplog.text
+    )
 
 
 def test_scans_that_are_meshes_are_sampled_again(ball_without_truth):
