@@ -74,7 +74,7 @@ DECLARED = PACKAGE / "declared.py"  # executes statements of the package's own s
 # What builds a tree by default, which on some points never ends where denormals count as zero (geometry/trees.py)
 TREES = {
     *("KDTree", "cKDTree", "kdtree", "BallTree", "NearestNeighbors", "KNeighborsClassifier", "KNeighborsRegressor"),
-    *("griddata", "NearestNDInterpolator", "RBFInterpolator", "ProximityQuery", "proximity"),
+    *("griddata", "NearestNDInterpolator", "RBFInterpolator", "ProximityQuery", "proximity", "pipelines"),
     *("sample_surface_even", "remove_close", "clusters", "group_distance"),
 }
 TREE_BUILDERS = {

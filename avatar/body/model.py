@@ -141,6 +141,10 @@ def check_bind(bind: Template) -> dict[str, int]:
     dims = check_shape("weights", bind.weights, "V J", **dims)
     check_shape("joints", bind.joints, "J 3", **dims)
     check_parents(bind.parents)
+    if twice := [name for name in bind.joint_names if bind.joint_names.count(name) > 1]:
+        raise AvatarError(
+            f"joint_names: expected each once, {twice[0]!r} is there {bind.joint_names.count(twice[0])} times."
+        )
     for name, count in (("parents", len(bind.parents)), ("joint_names", len(bind.joint_names))):
         if count != dims["J"]:
             raise AvatarError(f"{name}: expected {dims['J']} entries, as many as weights has columns, got {count}.")

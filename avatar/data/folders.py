@@ -12,16 +12,24 @@ SPLITS = ("train", "test", "interpolation")  # interpolation: unseen poses of th
 VALIDATION = "validation"  # training frames that a run held back: a split of `Outfit.with_validation`
 SAMPLE_FOLDER = Path(__file__).parents[1] / "assets" / "sample"
 OUTFIT_FORMAT = "outfit/1"
+READ_KEYS = {"format", "layout", "body", "mean_body"}  # of outfit.yaml
+KNOWN_KEYS = READ_KEYS | {"name", "units", "up", "licence", "source", "garments", "travel", "gates", "versions"}
 
 
 def read_outfit_settings(path: Path) -> dict[str, Any]:
-    """What ``outfit.yaml`` says, nothing where there is none; `DataError` for no mapping or an unknown format."""
+    """What ``outfit.yaml`` says, nothing where there is none.
+
+    Raises `DataError` for no mapping, an unknown format or misspelt keys.
+    """
     file = Path(path) / "outfit.yaml"
     if not file.is_file():
         return {}
     settings = read_yaml(file)
     if settings.get("format", OUTFIT_FORMAT) != OUTFIT_FORMAT:
         raise DataError(file, f"expected format {OUTFIT_FORMAT}, got {settings['format']}.", "Make the data again.")
+    for key in settings.keys() - KNOWN_KEYS:
+        if near := did_you_mean(key, READ_KEYS - settings.keys()):
+            raise DataError(file, f"expected keys such as {', '.join(sorted(READ_KEYS))}, got {key!r}.", near)
     return settings
 
 

@@ -120,6 +120,8 @@ class CanonicalOutfit(Outfit):
     posed frame: ``pose_vertices``, ``joint_transforms``, ``pose``.
     """
 
+    measured = False
+
     def __init__(self, posed: Outfit, scans: Path):
         super().__init__(posed.path, posed.dataset)
         self.posed, self.scans = posed, Path(scans)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Self
 
@@ -16,9 +18,12 @@ import torch
 from avatar.body.model import BodyModel
 from avatar.checks import AvatarError, DataError, did_you_mean, sentences
 from avatar.data.folders import SPLITS, VALIDATION
-from avatar.data.validation import check_frame, check_joints, check_pose, check_template
+from avatar.data.scan_validation import check_frame
+from avatar.data.validation import check_joints, check_pose, check_template
 from avatar.io.ledger import digest_of, file_digest, files_digest
 from avatar.records import BodyFit, Frame, Template
+
+log = logging.getLogger(__name__)
 
 
 class Outfit(ABC):
@@ -27,8 +32,11 @@ class Outfit(ABC):
     Where the true surface is known, there are ``resample`` and ``load_mesh`` as well (`OpenOutfit`).
     """
 
+    measured = True  # scans as a scanner gives them
+
     def __init__(self, path: Path, dataset: str = ""):
         self.held_back: tuple[str, ...] = ()
+        self._doubted: set[str] = set()
         self.path = Path(path)
         self.name = self.path.name
         self.dataset = dataset or self.path.parent.name
@@ -55,7 +63,10 @@ class Outfit(ABC):
             kinds = f"{', '.join(SPLITS[:-1])} or {SPLITS[-1]}"
             raise AvatarError(sentences(f"split: expected {kinds}{held}, got {split!r}.", near))
         if not self._listed[split]:
-            raise DataError(self.path / split, "expected frames (*.npz), found none.", "Make or download the data.")
+            there = (p for p in sorted((self.path / split).rglob("*")) if p.is_file() and not p.name.startswith("."))
+            other = ", ".join(str(path.relative_to(self.path / split)) for path in islice(there, 3))
+            found = f"found only {other}" if other else "found none"
+            raise DataError(self.path / split, f"expected frames (*.npz), {found}.", "Make or download the data.")
         return self._listed[split]
 
     def has_frames(self, split: str) -> bool:
@@ -73,12 +84,21 @@ class Outfit(ABC):
     def load(self, split: str, name: str) -> Frame:
         """One frame, checked: finite, in metres, scan over body.
 
-        Raises `AvatarError` for a frame that is not in the split, naming near ones; `DataError` for an invalid file.
+        What is doubtful is logged, each kind of it once an outfit. Raises `AvatarError` for a frame that is not in the
+        split, naming near ones; `DataError` for an invalid file.
         """
         path = self.frame_path(split, name)
         frame = self._read_frame(path, split, name)
-        check_frame(frame, self.template, path)
+        doubts = check_frame(frame, self.template, path, self.measured)
+        for kind, doubt in doubts.items() if self.measured else ():
+            self._doubt(kind, path, doubt)
         return frame
+
+    def _doubt(self, kind: str, path: Path, doubt: str) -> None:
+        """Logs what is doubtful about a file, the first time for its kind."""
+        if kind not in self._doubted:
+            self._doubted.add(kind)
+            log.warning("%s: %s (Others like it are not mentioned.)", path, doubt)
 
     def load_body(self, split: str, name: str) -> BodyFit:
         """The body under a frame; errors as in `load`."""

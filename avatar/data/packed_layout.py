@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from avatar.body.packed import write_body, write_template
 from avatar.body.registry import body_of_file, canonical_name
 from avatar.body.skinning import blend_transforms, skin_transforms
 from avatar.checks import DataError, check_shape, require
+from avatar.data.alignment import thin
 from avatar.data.folders import OUTFIT_FORMAT, SPLITS, read_outfit_settings
 from avatar.data.outfits import Outfit
 from avatar.data.validation import check_pose, check_posed, check_size, check_vertex_transforms
@@ -31,6 +32,7 @@ from avatar.records import BodyFit, Frame, Scan, Template
 
 log = logging.getLogger(__name__)
 
+ROUNDING = (5e-4, 2e-3)  # metres: doubtful, and refused
 BODY, MEAN = "body", "mean_body"  # keys of outfit.yaml
 BODY_FILES = {BODY: "template.npz", MEAN: "mean.npz"}  # where a body is that outfit.yaml gives no path
 
@@ -120,10 +122,27 @@ class PackedOutfit(Outfit):
             if key in stored and len(stored[key]) != expected:
                 problem = f"{key}: expected {expected} rows as in the template, got {len(stored[key])}."
                 raise DataError(path, problem, "The frame belongs to another body than the template.")
+        self._check_rounding(stored, path)
         if "pose" in stored:
             stored["pose"] = _stored_pose(stored["pose"], self.template.joint_names, path)
         stored = {k: v.astype(np.float32) if v.dtype.kind == "f" else v for k, v in stored.items()}
         return Frame(name, self.name, split, self._fit(stored, path), _stored_scan(stored, path))
+
+    def _check_rounding(self, stored: dict[str, np.ndarray], path: Path) -> None:
+        """Refuses positions so far from the origin that their type, or float32, rounds them much; some is doubtful."""
+        for key in ("scan_pc", "body_verts"):
+            if key not in stored or not stored[key].size:
+                continue
+            middle = float(np.abs(np.median(stored[key][thin(len(stored[key]), 1000)], axis=0)).max())
+            kind = np.float16 if stored[key].dtype.itemsize == 2 else np.float32
+            step = float(np.spacing(kind(middle)))
+            if step > ROUNDING[0]:
+                near = f"{key}: expected positions near the origin"
+                problem = f"{near}, {kind.__name__} rounds those at {middle:.4g} m to {step:.2g} m."
+                hint = "Move body, scan and translation to the origin; store float32."
+                if not step <= ROUNDING[1]:
+                    raise DataError(path, problem, hint)
+                self._doubt(f"{key} rounding", path, f"{problem} {hint}")
 
     def _fit(self, stored: dict[str, np.ndarray], path: Path) -> BodyFit:
         """The body of a frame, with what the file lacks derived from what it has, and the rest of it compared."""
@@ -140,9 +159,11 @@ class PackedOutfit(Outfit):
         transforms = whole if whole is not None else skinned if posed is None else posed.vertex_transforms
         if vertices is None:
             vertices = _move(transforms, template)
-        check_size(vertices, template, path)
+        if doubt := check_size(vertices, template, path):
+            self._doubt("size", path, doubt)
         if posed is not None:
-            check_posed(posed.vertices, vertices, "pose", template, path)
+            others = self._mistaken_poses(stored["pose"], vertices)
+            check_posed(posed.vertices, vertices, "pose", template, path, others)
         if given:
             check_posed(_move(skinned, template), vertices, "joint_transforms", template, path)
         if whole is not None:
@@ -160,6 +181,20 @@ class PackedOutfit(Outfit):
             translation=stored.get("translation", np.zeros(3, np.float32) if posed is None else posed.translation),
             pose=stored.get("pose"),
         )
+
+    def _mistaken_poses(self, pose: np.ndarray, vertices: np.ndarray) -> dict[str, Callable[[], np.ndarray]]:
+        """The body, as far along as ``vertices (V, 3)``, in poses that a frame's may have been mistaken for."""
+        names = list(self.template.joint_names)
+        sides = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in names]
+        poses = {"If negated": -pose, "If its root is at rest": np.concatenate([0 * pose[:1], pose[1:]])}
+        if set(sides) == set(names):
+            poses["If left and right are exchanged"] = pose[[names.index(name) for name in sides]]
+
+        def place(pose: np.ndarray) -> np.ndarray:
+            posed = self.fit_pose(pose).vertices
+            return posed + (vertices - posed).mean(axis=0)
+
+        return {words: partial(place, pose) for words, pose in poses.items()}
 
     def _joint_transforms(
         self, stored: dict[str, np.ndarray], posed: BodyFit | None, whole: np.ndarray | None, path: Path
@@ -192,7 +227,7 @@ def _stored_scan(stored: dict[str, np.ndarray], path: Path) -> Scan:
     faces, colors = scan.faces, scan.colors
     if faces is not None and faces.size and (faces.min() < 0 or faces.max() >= len(scan.points)):
         raise DataError(path, f"scan_faces: expected indices in [0, {len(scan.points)}), got others.")
-    faces = None if faces is None else faces.astype(np.int64)
+    faces = faces.astype(np.int64) if faces is not None and len(faces) else None
     colors = None if colors is None else unit_colors(path, colors, colors.dtype.kind in "iu")
     return replace(scan, normals=normals, faces=faces, colors=colors)
 

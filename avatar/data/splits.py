@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -11,8 +12,12 @@ import numpy as np
 from avatar.checks import AvatarError
 from avatar.data.folders import SPLITS
 from avatar.data.outfits import Outfit
+from avatar.io.npz import member_checksums
+
+log = logging.getLogger(__name__)
 
 Name = TypeVar("Name")
+NO_CONTENT = ("scan_name", "format")  # arrays that differ between copies of a frame
 SEVERAL_SEQUENCES = 4  # from here on whole sequences are held back, below it frames
 
 
@@ -38,10 +43,13 @@ class Split:
 
 
 def split_outfit(outfit: Outfit, config: SplitConfig | None = None) -> Split:
-    """The split of an outfit's training frames, after a check that no test frame is among them."""
+    """The split of an outfit's training frames, after a check that no test frame is among them (`check_leakage`,
+    `check_copies`).
+    """
     train = outfit.frames("train")
     for split in SPLITS[1:]:
         check_leakage(train, outfit.frames(split) if outfit.has_frames(split) else (), f"{outfit.name}, {split}")
+    check_copies(outfit)
     return split_frames(train, config or SplitConfig())
 
 
@@ -94,3 +102,27 @@ def spaced_frames(names: Sequence[Name], count: int | None) -> list[Name]:
     if count is None or count >= len(names):
         return list(names)
     return [names[round(i * (len(names) - 1) / max(count - 1, 1))] for i in range(count)]
+
+
+def check_copies(outfit: Outfit) -> None:
+    """Refuses scans that are in train and in another split, under whatever names; copies within train are logged.
+
+    Scans are compared by the checksums in their files' directories. Raises `AvatarError` naming the first such frames.
+    """
+    seen: dict[object, str] = {}
+    copies: dict[str, list[str]] = {}
+    for split in SPLITS:
+        for name in outfit.frames(split) if outfit.has_frames(split) else ():
+            arrays = member_checksums(outfit.path / split / f"{name}.npz")
+            content = arrays.get("scan_pc") or frozenset(item for item in arrays.items() if item[0] not in NO_CONTENT)
+            if not content:
+                continue
+            first = seen.setdefault(content, f"{split}/{name}") if split == "train" else seen.get(content)
+            if first not in (None, f"{split}/{name}"):
+                copies.setdefault(split, []).append(f"{split}/{name} = {first}")
+    for split, pairs in copies.items():
+        problem = f"{outfit.path}: {len(pairs)} {split} frames have the scan of another frame of train"
+        shown = f"{problem} ({', '.join(pairs[:3])})"
+        if split != "train":
+            raise AvatarError(f"{shown}. Remove them from one.")
+        log.warning("%s, which counts once more in training; remove them.", shown)

@@ -1,36 +1,30 @@
-"""Checks of what is loaded: units, axes, overlap of scan and body, normals, and that a frame's parts say the same."""
+"""Checks of bodies and fits: units, axes, faces, joints, and that a frame's pose, transforms and vertices agree."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from avatar.body.model import SMPL_JOINTS, SMPL_PARENTS
 from avatar.body.packed import border_positions
 from avatar.checks import AvatarError, DataError, check_finite
-from avatar.geometry.trees import build_tree
-from avatar.records import Frame, Scan, Template
+from avatar.data.alignment import show_vector, thin
+from avatar.records import Template
 
-SKIN_SAMPLES = 500  # places on the body, spread by area
-SCAN_SAMPLES = 4_000
-DEEP_SAMPLES = 500  # scan points whose side of the skin is looked at
-NEAR = 0.10  # metres from skin to scan; a wide dress is farther from the legs, and near everywhere else
-DEEP = 0.03  # metres under the skin, beyond what a good fit leaves
-CURED, CURED_BURIED = 0.9, 0.05  # share of the body that a suggestion must bring near the scan, and of scan buried
 BODY_HEIGHT = (0.5, 2.5)  # metres, at rest
 SIZE_RATIO = (0.25, 2.5)  # posed body to body at rest, and scan to posed body: beyond it units differ
-UNITS = {"centimetres": 100, "millimetres": 1000}  # in a metre
-FEWEST_POINTS = 100
-FAR_OFF = 10.0  # metres between the middles of scan and body that only a translation in other units explains
-# A valid frame covers 94% and more of the body, long dresses and raw scans included, and buries nothing.
-LEAST_COVERED, MOST_BURIED = 0.6, 0.05  # each alone is a misfit
-DOUBTFUL_COVERED, DOUBTFUL_BURIED, DOUBTFUL_OUTWARD = 0.85, 0.01, 0.8  # the first with one of the others
-INSIDE_OUT, UNORIENTED = 0.25, 0.7  # shares of normals that point outward
+ROUNDED = 5e-4  # metres that a body's vertices may be rounded by
+LONG_EDGE, SAME_WAY = 0.15, 0.05  # median edge to size of a body; share of directed edges that two faces have
+UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048, "decimetres": 0.1}  # metres
+UNITS["kilometres, or metres scaled twice"] = 1000.0
+LIKE = 1.5  # times larger or smaller than a unit would make it, and still taken for it
+DIFFERENT_SIZE = (0.04, 0.08)  # share that a body or scan is larger or smaller than it should be: doubtful, refused
 ALONG = 0.7  # cosine to an axis from which on a direction runs along it
 MOST_TURN = 2 * np.pi + 0.1  # radians; no joint turns farther, and degrees soon exceed it
+FOLLOWED = 0.1  # skinning weight of a joint's own vertices
 JOINT_GAP, JOINTS_GAP = 0.25, 0.12  # metres from a joint to its weights' border: one, median (open body: 0.13, 0.04)
 APART, SHARE = 0.05, 0.99  # metres between posed bodies at that share of vertices: margin for lost blendshapes
 EDGE_ERROR = 0.18  # of the edges' length: 0.03 to 0.10 where right (sample outfits), 0.27 and more for no rotation
@@ -41,7 +35,11 @@ TURNS = {  # where it should lie and where it does: what corrects it
     ("+y", "-z"): "Turn body and scans by 90 degrees about x: (x, y, z) to (x, -z, y).",
     ("+y", "+x"): "Turn body and scans by 90 degrees about z: (x, y, z) to (-y, x, z).",
     ("+y", "-x"): "Turn body and scans by -90 degrees about z: (x, y, z) to (y, -x, z).",
-    ("+x", "-x"): "Either it faces -z (turn body and scans by 180 degrees about y), or it is mirrored (negate x).",
+    (
+        "+x",
+        "-x",
+    ): "It faces -z (turn body and scans by 180 degrees about y), is mirrored (negate x), or joint_names have "
+    "left and right exchanged.",
     ("+x", "+z"): "Turn body and scans by 90 degrees about y: (x, y, z) to (z, y, -x).",
     ("+x", "-z"): "Turn body and scans by -90 degrees about y: (x, y, z) to (-z, y, x).",
 }
@@ -54,25 +52,60 @@ def check_template(template: Template, path: Path) -> None:
     """
     extents = np.ptp(template.vertices.numpy(), axis=0)
     low, high = BODY_HEIGHT
+    middle = float(template.vertices.median(dim=0).values.abs().max())
+    if (step := float(np.spacing(np.float32(middle)))) > ROUNDED:
+        problem = f"vertices: expected a body near the origin, float32 rounds those at {middle:.4g} m to {step:.2g} m."
+        raise DataError(path, problem, "Move vertices, joints and frames to the origin.")
+    _check_edges(template, path)
     if low <= extents.max() <= high:
         _check_axes(template, path)
     if not low <= extents[1] <= high:
         problem = f"vertices: expected a body {low} to {high} m high, got {extents[1]:.4g} along y."
-        raise DataError(path, problem, _unit_hint(float(extents[1])))
+        raise DataError(path, problem, _unit_hint(float(extents[1]), low, high))
 
 
 def _check_axes(template: Template, path: Path) -> None:
     """Refuses a body whose joints, or whose shape where they are unknown, do not stand upright facing +z."""
+    plain = {name.strip().lower().replace(" ", "_").replace("-", "_"): name for name in template.joint_names}
+    if set(SMPL_JOINTS) <= plain.keys() and (other := [joint for joint in SMPL_JOINTS if plain[joint] != joint]):
+        problem = f"joint_names: expected SMPL's, such as {other[0]!r}, got {plain[other[0]]!r}."
+        raise DataError(path, problem, "Write them in lower case with underscores, without blanks.")
+    width, height, depth = np.ptp(template.vertices.numpy(), axis=0)
+    upright = height > 2 * depth and height > width / 2
     places = dict(zip(template.joint_names, template.joints.numpy().astype(np.float64)))
     for start, end, wanted in AXES:
         if start in places and end in places and (found := _axis_along(places[end] - places[start])) != wanted:
             problem = f"joints: expected {end} towards {wanted} from {start}, it lies towards {found or 'no axis'}."
             hint = TURNS.get((wanted, found), "Turn body and scans so that y is up and the body faces +z.")
+            hint += " Or joint_names are in another order than joints." if wanted == "+y" and upright else ""
             raise DataError(path, problem, hint)
-    _, height, depth = np.ptp(template.vertices.numpy(), axis=0)
+    vertices, faces = template.vertices.double(), template.faces
+    a, b, c = (vertices[faces[:, corner]] - vertices.mean(dim=0) for corner in range(3))
+    if (volume := float((a * b.cross(c, dim=1)).sum()) / 6) < 0:
+        problem = f"faces: expected them counter-clockwise from outside, they enclose {volume:.3f} m³: wound inward."
+        hint = "Swap two columns of the faces; or, if the body is mirrored as well, negate x of the vertices instead."
+        raise DataError(path, problem, hint)
     if height < depth / 2:
         problem = f"vertices: expected a body that stands along y, it is {height:.2f} m high and {depth:.2f} m deep."
         raise DataError(path, problem, TURNS["+y", "+z"])
+
+
+def _check_edges(template: Template, path: Path) -> None:
+    """Refuses faces that are not those of the vertices, or not wound one way."""
+    vertices, faces = template.vertices.numpy(), template.faces.numpy()
+    starts, ends = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    length = float(np.median(np.linalg.norm(vertices[ends] - vertices[starts], axis=1)))
+    size = float(np.ptp(vertices, axis=0).max())
+    if length > LONG_EDGE * size:
+        problem = f"faces: expected edges that are short against the body, half of them are {length / size:.0%} of it."
+        raise DataError(path, problem, "Are the faces those of these vertices, in their order?")
+    if (repeated := len(faces) - len(np.unique(np.sort(faces, axis=1), axis=0))) > SAME_WAY * len(faces):
+        problem = f"faces: expected each once, {repeated} of {len(faces)} are there once more."
+        raise DataError(path, problem, "Leave them out.")
+    _, counts = np.unique(starts * len(vertices) + ends, return_counts=True)
+    if (share := float((counts > 1).mean())) > SAME_WAY:
+        problem = f"faces: expected neighbours to run along their edge either way, on {share:.0%} of edges they do not."
+        raise DataError(path, problem, "They are not wound one way: recompute their orientation (MeshLab, Blender).")
 
 
 def _axis_along(direction: np.ndarray) -> str:
@@ -87,6 +120,17 @@ def check_joints(template: Template, path: Path) -> None:
 
     Joints without a border (`joint_positions`) are not judged. Raises `DataError` with the largest gap and its cause.
     """
+    names = template.joint_names
+    for joint, parent in zip(SMPL_JOINTS[1:], (SMPL_JOINTS[parent] for parent in SMPL_PARENTS[1:])):
+        if joint in names and parent in names and parent not in (above := _ancestors(template, names.index(joint))):
+            problem = f"parents: expected {parent} above {joint}, there are {', '.join(above) or 'no joints'}."
+            raise DataError(path, problem, "Are parents in the order of the joints' names?")
+    strongest = template.weights.amax(dim=0)
+    moved = [joint for joint in SMPL_JOINTS if joint in names]
+    still = [joint for joint in moved if strongest[names.index(joint)] < FOLLOWED]
+    if len(still) > len(moved) / 2:
+        problem = f"weights: expected vertices that follow each joint, none follows {', '.join(still[:4])}."
+        raise DataError(path, problem, "Are the columns of weights in the order of the joints, and those of this body?")
     vertices = template.vertices.numpy()
     borders = border_positions(vertices, template.weights.numpy(), template.parents)
     judged = np.isfinite(borders[:, 0]) & (np.arange(len(borders)) > 0)
@@ -110,186 +154,83 @@ def check_joints(template: Template, path: Path) -> None:
     raise DataError(path, problem, _joint_hint(joints, borders, names, fit))
 
 
+def _ancestors(template: Template, joint: int) -> list[str]:
+    """Names of the joints above a joint, the nearest first."""
+    found = []
+    while (joint := template.parents[joint]) >= 0:
+        found.append(template.joint_names[joint])
+    return found
+
+
 def _joint_hint(joints: np.ndarray, borders: np.ndarray, names: list[str], fit: Callable[[np.ndarray], bool]) -> str:
     """What would lay joints ``(J, 3)`` on the borders of their weights ``(J, 3)``, so that they ``fit``."""
-    for unit, factor in UNITS.items():
-        if fit(joints / factor):
-            return f"They look like {unit}: divide joints by {factor}."
+    for unit, metres in UNITS.items():
+        if fit(joints * metres):
+            return f"They look like {unit}: divide joints by {1 / metres:.5g}."
     other = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in names]
     if set(other) == set(names) and fit(joints[[names.index(name) for name in other]]):
         return "The weights of left and right look swapped: exchange their columns, or the joints' names."
     shift = np.median(borders - joints, axis=0)
     if fit(joints + shift):
-        return f"Moving all joints by {_vector(shift)} m would lay them there."
+        return f"Moving all joints by {show_vector(shift)} m would lay them there."
     return "Are joints in the order of the weights' columns, at rest, in metres, in the vertices' coordinates?"
 
 
-def check_frame(frame: Frame, template: Template, path: Path) -> None:
-    """Refuses a frame whose body or scan is empty, in other units, not where the other is, or inside out."""
-    scan, body, faces = frame.scan, frame.body.vertices, template.faces.numpy()
-    if len(scan.points) < FEWEST_POINTS:
-        problem = f"scan: expected at least {FEWEST_POINTS} points, got {len(scan.points)}."
-        raise DataError(path, problem, "Leave the frame out or scan it again.")
-    check_size(body, template, path)
-    _check_ratio("scan", scan.points, body, "the body", path)
-    lengths = np.linalg.norm(scan.normals, axis=1)
-    if (np.abs(lengths - 1) > 0.05).mean() > 0.01:
-        problem = f"scan normals: expected unit length, got {lengths.min():.3g} to {lengths.max():.3g}."
-        raise DataError(path, problem, "Normalise them, or compute them anew.")
-    overlap = measure_overlap(scan.points, scan.normals, body, faces)
-    _check_overlap(overlap, scan, body, faces, path)
-    _check_normals(overlap, scan, path)
+def check_size(body: np.ndarray, template: Template, path: Path) -> str:
+    """Refuses a posed body ``(V, 3)`` in other units than its template, or of another person; gives a doubt, or "".
+
+    Raises `DataError` with the factor: of the bounding boxes, or the median of the edges' lengths, which poses keep.
+    """
+    check_ratio("body", body, template.vertices.numpy(), "at rest", path)
+    edges = template.faces[:, :2].numpy()[thin(len(template.faces), 2000)]
+    lengths = [
+        np.linalg.norm(np.diff(v[edges].astype(np.float64), axis=1)[:, 0], axis=1)
+        for v in (body, template.vertices.numpy())
+    ]
+    ratio = float(np.median(lengths[0] / np.maximum(lengths[1], 1e-9)))
+    if abs(ratio - 1) <= DIFFERENT_SIZE[0]:
+        return ""
+    problem = f"body: expected it to be as large as at rest, its edges are {ratio:.2f} times as long."
+    hint = "Is it the body of this person, of the same shape (betas) as the template?"
+    if abs(ratio - 1) > DIFFERENT_SIZE[1]:
+        raise DataError(path, problem, hint)
+    return f"{problem} {hint}"
 
 
-def check_size(body: np.ndarray, template: Template, path: Path) -> None:
-    """Refuses a posed body ``(V, 3)`` in other units than its template. Raises `DataError` with the factor."""
-    _check_ratio("body", body, template.vertices.numpy(), "at rest", path)
-
-
-def _check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, path: Path) -> None:
+def check_ratio(what: str, points: np.ndarray, like: np.ndarray, words: str, path: Path) -> None:
     """Refuses points of another size than those they should be like, by the diagonals of their bounding boxes."""
     size, expected = (float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (points, like))
     low, high = SIZE_RATIO
     if not low <= size / expected <= high:
         problem = f"{what}: expected about {expected:.2f} m across as {words}, got {size:.4g}."
-        raise DataError(path, problem, _unit_hint(size))
+        raise DataError(path, problem, _unit_hint(size, expected / LIKE, expected * LIKE))
 
 
-def _unit_hint(size: float) -> str:
-    for unit, factor in UNITS.items():
-        if BODY_HEIGHT[0] <= size / factor <= 2 * BODY_HEIGHT[1]:
-            return f"That looks like {unit}: divide positions and translations by {factor} (multiply by {1 / factor})."
-    if BODY_HEIGHT[0] <= size * 1000 <= 2 * BODY_HEIGHT[1]:
-        return "That looks like kilometres, or metres scaled twice: multiply positions and translations by 1000."
-    return "Positions must be in metres with y up."
+def _unit_hint(size: float, low: float, high: float) -> str:
+    """What to do with positions of a ``size`` that should be ``low`` to ``high`` metres."""
+    usual = np.sqrt(low * high)
+    found = [unit for unit, metres in UNITS.items() if low <= size * metres <= high]
+    if not found:
+        return "Positions must be in metres with y up, and a scan must hold nothing but the person."
+    found.sort(key=lambda unit: abs(np.log(size * UNITS[unit] / usual)))
+    metres = UNITS[found[0]]
+    todo = f"divide positions and translations by {1 / metres:.5g} (multiply by {metres:g})"
+    todo = todo if metres < 1 else f"multiply positions and translations by {metres:g}"
+    return f"That looks like {' or '.join(found)}: {todo}."
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """Shares: of skin with a scan point near, of scan deep under the skin, of scan normals that point as it does."""
-
-    covered: float
-    buried: float
-    outward: float
-
-
-def measure_overlap(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> Overlap:
-    """How scan points ``(M, 3)`` lie over a body ``(V, 3)`` with faces ``(F, 3)``; looks at some of each, in 10 ms."""
-    centres, outward, skin = _face_frames(vertices, faces)
-    some = _thin(len(points), DEEP_SAMPLES)
-    _, below = build_tree(centres).query(points[some])
-    heights = ((points[some] - centres[below]) * outward[below]).sum(axis=1)
-    return Overlap(
-        covered=_coverage(points)(skin),
-        buried=float((heights < -DEEP).mean()),
-        outward=float(((normals[some] * outward[below]).sum(axis=1) > 0).mean()),
-    )
-
-
-def _face_frames(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres and unit normals of faces ``(F, 3)``, and centres ``(S, 3)`` at even steps of the area, in float64.
-
-    Hands are a small part of the area, and a large one of the faces.
-    """
-    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
-    crosses = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(crosses, axis=1)
-    centres, areas = (a + b + c) / 3, (lengths / 2).cumsum()
-    places = np.searchsorted(areas, (np.arange(SKIN_SAMPLES) + 0.5) / SKIN_SAMPLES * areas[-1])
-    return centres, crosses / np.maximum(lengths, 1e-20)[:, None], centres[places.clip(max=len(areas) - 1)]
-
-
-def _thin(count: int, most: int) -> np.ndarray:
-    """At most so many indices below a count, evenly."""
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
-
-
-def _coverage(points: np.ndarray) -> Callable[[np.ndarray], float]:
-    """What measures the share of places on the skin with one of a scan's points within reach."""
-    some = points[_thin(len(points), SCAN_SAMPLES)]
-    tree, spacing = build_tree(some), np.sqrt(2 / len(some))  # of points on two square metres of person
-    reach = max(NEAR, 2 * spacing)
-    return lambda skin: float(np.isfinite(tree.query(skin, distance_upper_bound=reach)[0]).mean())
-
-
-def _check_overlap(overlap: Overlap, scan: Scan, body: np.ndarray, faces: np.ndarray, path: Path) -> None:
-    """Refuses a scan that does not lie over its body, with the move or turn that would lay it there."""
-    inside_out = overlap.outward < INSIDE_OUT
-    doubtful = overlap.covered < DOUBTFUL_COVERED and (
-        overlap.buried > DOUBTFUL_BURIED or (overlap.outward < DOUBTFUL_OUTWARD and not inside_out)
-    )
-    if not (overlap.covered < LEAST_COVERED or overlap.buried > MOST_BURIED or doubtful):
-        return
-    problem = (
-        f"scan: expected it over its body, {overlap.covered:.0%} of the body has a scan point within "
-        f"{NEAR:.2f} m and {overlap.buried:.0%} of the scan lies deep inside."
-    )
-    shift = np.median(body, axis=0) - np.median(scan.points, axis=0)
-    if np.abs(shift).max() > FAR_OFF:
-        hint = f"Their middles differ by {_vector(shift, 1)} m: is the translation in metres?"
-    else:
-        hint = suggest_hint(scan.points, scan.normals, body, faces)
-    raise DataError(path, problem, hint)
-
-
-def suggest_hint(points: np.ndarray, normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> str:
-    """What would lay a scan over its body: a move, a turn by right angles, a mirror; or that none of them does."""
-    covered, (_, _, skin) = _coverage(points), _face_frames(vertices, faces)
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    best, words, corrected = 0.0, "", points
-    for name, linear in _mistakes():
-        moved = skin @ linear  # the inverse of an orthogonal matrix is its transpose: the body goes to the scan
-        if name and (share := covered(moved)) > best:
-            best, words, corrected = share, name, points @ linear.T
-        shift = middle - (moved.min(axis=0) + moved.max(axis=0)) / 2
-        share = covered(moved + shift)
-        if share > best + 0.02:  # a suggestion without a move is the simpler one
-            back = -linear @ shift
-            words = f"{name} and moving it by {_vector(back)} m" if name else f"Moving it by {_vector(back)} m"
-            best, corrected = share, points @ linear.T + back
-    if best < CURED or measure_overlap(corrected, normals, vertices, faces).buried > CURED_BURIED:
-        return "Neither a move, a turn by right angles nor a mirror corrects it: is the fit of another frame or person?"
-    return f"{words} would lay it over the body; or do the reverse to the fit."
-
-
-def _mistakes() -> Iterator[tuple[str, np.ndarray]]:
-    """What may have to be done to a scan, in words and as an orthogonal matrix; the first is nothing."""
-    yield "", np.eye(3)
-    for axis in "xyz":
-        for angle in (-90, 90, 180):
-            turn = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
-            yield f"Turning the scan by {angle} degrees about {axis}", turn
-    for axis, row in zip("xyz", np.eye(3)):
-        yield f"Mirroring the scan ({axis} to -{axis})", np.diag(1 - 2 * row)
-    yield "Swapping y and z of the scan", np.eye(3)[[0, 2, 1]]
-
-
-def _vector(steps: np.ndarray, digits: int = 2) -> str:
-    return f"({', '.join(f'{step:.{digits}f}' for step in steps)})"
-
-
-def _check_normals(overlap: Overlap, scan: Scan, path: Path) -> None:
-    """Refuses normals that point inward, or either way, and faces that are wound against them."""
-    if overlap.outward < INSIDE_OUT:
-        problem = f"scan normals: expected them to point outward, {1 - overlap.outward:.0%} point into the body."
-        raise DataError(path, problem, "The scan is inside out: multiply its normals by -1.")
-    if overlap.outward < UNORIENTED:
-        problem = f"scan normals: expected them to point outward, only {overlap.outward:.0%} do."
-        raise DataError(path, problem, "Orient them (MeshLab, Open3D), or compute them from the mesh.")
-    if scan.faces is None or not len(scan.faces):
-        return
-    some = scan.faces[:: max(1, len(scan.faces) // 1000)]
-    a, b, c = (scan.points[some[:, corner]] for corner in range(3))
-    agree = float(((np.cross(b - a, c - a) * scan.normals[some[:, 0]]).sum(axis=1) > 0).mean())
-    if agree < 0.5:
-        problem = f"scan faces: expected them counter-clockwise from outside, {1 - agree:.0%} are not."
-        raise DataError(path, problem, "Swap two columns of the faces.")
-
-
-def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Template, path: Path) -> None:
+def check_posed(
+    posed: np.ndarray,
+    vertices: np.ndarray,
+    what: str,
+    template: Template,
+    path: Path,
+    others: Mapping[str, Callable[[], np.ndarray]] | None = None,
+) -> None:
     """Refuses ``vertices (V, 3)`` that ``posed (V, 3)``, the template posed by the frame's ``what``, does not meet.
 
-    Raises `DataError` with the distance, metres, and the likely cause.
+    ``others`` give the template posed otherwise, by words for it, to find out what was mistaken. Raises `DataError`
+    with the distance, metres, and the likely cause.
     """
 
     def distance(moved: np.ndarray) -> float:  # that all but a hundredth of the vertices keep
@@ -301,16 +242,19 @@ def check_posed(posed: np.ndarray, vertices: np.ndarray, what: str, template: Te
     turn, _ = Rotation.align_vectors(vertices - middle, posed - other)
     turned = turn.apply(posed - other) + middle
     if distance(posed + middle - other) <= APART:
-        hint = f"A move of {_vector(middle - other)} m would: is the translation right?"
+        hint = f"A move of {show_vector(middle - other)} m would: is the translation right?"
     elif distance(turned) <= APART:
         degrees = np.degrees(turn.magnitude())
         hint = f"Turning the whole body by {degrees:.0f} degrees would: is the root's rotation in both?"
     else:
         off = np.linalg.norm(turned - vertices, axis=1) > APART
         joint = template.joint_names[int(template.weights.numpy()[off].sum(axis=0).argmax())]
-        hint = (
-            f"Vertices of {joint} are off most. Is {what} this frame's, with joints in the template's order, not "
-            "negated and not zeros, and are the template's shape (betas), weights and joints this person's?"
+        words = next((words for words, pose in (others or {}).items() if distance(pose()) <= APART), "")
+        hint = f"Vertices of {joint} are off most. " + (
+            f"{words} it does: correct {what}."
+            if words
+            else f"Is {what} this frame's, with joints in the template's order, not negated and not zeros, and are the "
+            "template's shape (betas), weights and joints this person's?"
         )
     problem = f"{what}: expected it to put the template on the frame's body, it leaves {1 - SHARE:.0%} of the vertices"
     raise DataError(path, f"{problem} {apart:.3f} m or more away.", hint)
@@ -327,7 +271,11 @@ def check_vertex_transforms(transforms: np.ndarray, template: Template, vertices
     posed = vertices[ends].astype(np.float64) - vertices[starts]
     lengths = np.linalg.norm(rest, axis=1).sum()
 
-    def pose_edges(linear: np.ndarray) -> np.ndarray:
+    if (volume := float(np.median(np.linalg.det(linear)))) < 0:
+        problem = f"vtransf: expected rotations, their determinants are {volume:.2f}: they mirror."
+        raise DataError(path, problem, "Negate one coordinate of scan and body, and make the transforms anew.")
+
+    def pose_edges(linear: np.ndarray, rest: np.ndarray = rest) -> np.ndarray:
         return np.einsum("eij,ej->ei", (linear[starts] + linear[ends]) / 2, rest)
 
     def error(edges: np.ndarray) -> float:
@@ -344,6 +292,8 @@ def check_vertex_transforms(transforms: np.ndarray, template: Template, vertices
     elif error(turn.apply(skinned)) <= EDGE_ERROR:
         degrees = np.degrees(turn.magnitude())
         hint = f"Turned by {degrees:.0f} degrees as a whole it does: is the root's rotation in both?"
+    elif error(pose_edges(linear, rest * [-1, 1, 1])) <= EDGE_ERROR:
+        hint = "With the template mirrored it does: negate x of body and scan, or of the template and its faces' order."
     elif np.abs(linear - np.eye(3)).max() < 1e-3:
         hint = "It is the identity: bring this frame's transforms, or leave the key out where pose is there."
     else:

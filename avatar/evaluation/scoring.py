@@ -147,36 +147,49 @@ def measure_floors(
     outfit: Outfit, split: str, config: ScoreConfig, points: int, commit: str = "", ledger: Ledger | None = None
 ) -> Scores:
     """Scores floors as if they were predictions of so many ``points``, each frame for itself. ``sampling`` is a second
-    sampling of the true surface: what a perfect surface scores. Outfits without ``resample`` have their scan points
-    split into halves instead, variant ``halves``: with fewer points that floor is too high. ``body`` are points spread
-    area-uniformly over the posed bare body.
+    sampling of the true surface: what a perfect surface scores. Outfits without ``resample`` are sampled from their
+    scans' meshes (variant ``mesh``); where these are points there is no sampling floor, and a warning says so. ``body``
+    are points spread area-uniformly over the posed bare body.
     """
     resample, config = getattr(outfit, "resample", None), replace(config, motion=False)
+    names = frame_names(outfit, split)
+    meshes = resample is None and have_meshes(outfit, split, names)
 
     def sampling(frame: Frame) -> Comparison:
-        scan = draw_scan(frame, config)
-        if resample is None:
-            order = frame_generator(frame.name, config.seed + 1).permutation(len(scan.points))
-            halves = map(np.sort, np.array_split(order, 2))
-            again, scan = (Scan(scan.points[half], scan.normals[half]) for half in halves)
+        scan, seed = draw_scan(frame, config), config.seed + 1
+        if meshes:
+            again = sample_body(Mesh(frame.scan.points, frame.scan.faces), points, seed)
         else:
-            again = resample(split, frame.name, points, seed=config.seed + 1)
+            sampled = resample(split, frame.name, points, seed=seed)
+            again = PointCloud(sampled.points, sampled.normals)
             if (again.points[:10, None] == frame.scan.points).all(axis=2).any(axis=1).all():
                 raise AvatarError("resample: expected another sampling of the surface, got the scan's own points.")
-        return Comparison(PointCloud(again.points, again.normals), scan, posed_body(outfit, frame))
+        return Comparison(again, scan, posed_body(outfit, frame))
 
     def bare(frame: Frame) -> Comparison:
         body = posed_body(outfit, frame)
         return Comparison(sample_body(body, points, config.seed), draw_scan(frame, config), body)
 
-    if resample is None:
-        log.warning("%s: no true surface to sample again, so the sampling floor compares scan halves.", outfit.name)
+    floors = {"sampling": sampling} if meshes or resample else {}
     contenders = []
-    for floor, compare, variant in (("sampling", sampling, "" if resample else "halves"), ("body", bare, "")):
+    for floor, compare in (floors | {"body": bare}).items():
+        label = Label(floor, variant="mesh" if meshes and floor == "sampling" else "", commit=commit, split=split)
         memory = remember_points(ledger, floor, outfit, split, config, points=points)
-        contenders.append(Contender(Label(floor, variant=variant, commit=commit, split=split), compare, memory))
+        contenders.append(Contender(label, compare, memory))
     metrics = [metric for metric in find_metrics(config.metrics) if not metric.needs_mesh]
-    return score_frames(outfit, split, frame_names(outfit, split), metrics, contenders)
+    return score_frames(outfit, split, names, metrics, contenders)
+
+
+def have_meshes(outfit: Outfit, split: str, names: Sequence[str]) -> bool:
+    """Whether the scans of all frames are meshes, so that their surface can be sampled again; a warning if not.
+
+    Halves of a scan would give a floor that methods, which are compared with all of it, lie below.
+    """
+    without = next((name for name in names if outfit.load(split, name).scan.faces is None), None)
+    if without is not None:
+        reason = f"the scan of {without} has no scan_faces, so that its surface cannot be sampled again"
+        log.warning("%s: there is no sampling floor, and no excess over it: %s.", outfit.name, reason)
+    return without is None
 
 
 def remember_points(
@@ -203,10 +216,9 @@ def sample_body(body: Mesh, points: int, seed: int) -> PointCloud:
 
 def draw_scan(frame: Frame, config: ScoreConfig) -> Scan:
     """The scan points a frame is scored against: a random subset, the same for every method."""
-    count = len(frame.scan.points)
-    if count <= config.scan_points:
+    if len(frame.scan.points) <= config.scan_points:
         return frame.scan
-    chosen = np.sort(frame_generator(frame.name, config.seed).permutation(count)[: config.scan_points])
+    chosen = np.sort(frame_generator(frame.name, config.seed).permutation(len(frame.scan.points))[: config.scan_points])
     return Scan(frame.scan.points[chosen], frame.scan.normals[chosen])
 
 

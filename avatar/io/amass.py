@@ -26,6 +26,7 @@ TRANSLATIONS = ("trans", "transl", "Th")
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate")
 SHAPES = ("betas", "shapes", "shape", "beta")
 KEYS = tuple(dict.fromkeys((*WHOLE, *sum(PARTS, ()), *TRANSLATIONS)))
+UNIT_TOLERANCE = 1e-2  # of the lengths of quaternions and of rows of matrices
 WIDTHS = (66, 72, 75, 78, 90, 99, 156, 159, 165)  # SMPL's 22 and 24 joints; with PCA hands; SMPL-H's; SMPL-X's
 
 
@@ -127,6 +128,7 @@ def _whole_poses(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:
     if key is None:
         raise DataError(path, f"expected poses (T, 66 or more), or {known}, got neither.")
     poses = _frames(path, key, found[key])
+    _check_rotations(path, key, poses)
     if poses.shape[1] < 3 * JOINTS or poses.shape[1] % 3:
         raise DataError(path, f"expected {key} (T, 66 or more), or {known}, got {key} {found[key].shape}.")
     if poses.shape[1] not in WIDTHS:
@@ -135,6 +137,16 @@ def _whole_poses(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:
             *(path, key, poses.shape[1], ", ".join(map(str, WIDTHS)), 3 * JOINTS),
         )
     return poses
+
+
+def _check_rotations(path: Path, key: str, poses: np.ndarray) -> None:
+    """Refuses rotations ``(T, P)`` in other forms than axis-angle, which unit lengths give away."""
+    for size, form, row in ((9, "rotation matrices", 3), (6, "6D rotations", 3), (4, "quaternions", 4)):
+        if poses.shape[1] % size == 0 and poses.size:
+            lengths = np.linalg.norm(poses.reshape(-1, row), axis=1)
+            if np.abs(lengths - 1).max() < UNIT_TOLERANCE:
+                problem = f"{key}: expected axis-angles of at least 22 joints, got {poses.shape[1]} numbers a frame."
+                raise DataError(path, problem, f"These are {form} of {poses.shape[1] // size} joints: convert them.")
 
 
 def _easymocap(

@@ -22,6 +22,7 @@ from avatar.io.stance import (
     FRAMES,
     Y_FROM,
     check_joint_order,
+    check_order,
     check_sides,
     check_travel,
     check_units,
@@ -222,6 +223,7 @@ def _read_npz(path: Path, up: str | None, rest: np.ndarray, fps: float | None, u
     low, high = (places[:, _both(joint)].mean(axis=1) for joint in ("ankle", "shoulder"))
     up = settle_up(path, low, high, up, usual)
     check_joint_order(path, motion.poses[:FRAMES])
+    check_order(path, motion.poses[:FRAMES])
     motion = turn_up(motion, up)
     check_travel(path, places @ Y_FROM[up].T, motion.translations[:FRAMES], motion.fps, units)
     return motion

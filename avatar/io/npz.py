@@ -75,11 +75,7 @@ def read_arrays(
 
 def npz_keys(path: Path) -> set[str]:
     """The keys of an npz file, unread; none of what is no such file."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {name.removesuffix(".npy") for name in archive.namelist()}
-    except (*DAMAGED, ValueError):
-        return set()
+    return set(member_checksums(path))
 
 
 def read_npy(path: Path, description: str, limit: int = SIZE_LIMIT) -> np.ndarray:
@@ -88,6 +84,16 @@ def read_npy(path: Path, description: str, limit: int = SIZE_LIMIT) -> np.ndarra
     check_file(path, limit)
     with path.open("rb") as stream:
         return _read_stream(path, stream, path.stat().st_size, path.name, kind, pattern, {})
+
+
+def member_checksums(path: Path) -> dict[str, tuple[int, int]]:
+    """CRC-32 and bytes of an npz file's arrays by key, from its directory alone; nothing of a file that has none."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            infos = archive.infolist()[:MEMBER_LIMIT]
+            return {info.filename.removesuffix(".npy"): (info.CRC, info.file_size) for info in infos}
+    except (*DAMAGED, ValueError):
+        return {}
 
 
 def _members(path: Path, archive: zipfile.ZipFile, limit: int) -> dict[str, zipfile.ZipInfo]:

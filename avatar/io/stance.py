@@ -32,6 +32,8 @@ FASTEST = 15.0  # m/s of the pelvis, for one frame in twenty
 RISE = 3.0  # m between the pelvis's highest and lowest place: more is mentioned
 STILL = 0.001  # m
 PLANTED = 0.5  # share of the feet's movement about the pelvis that its travel explains, where one can tell a unit
+SLIDING = 2.0  # times that translations are too long or too short for the feet: more is mentioned
+JUMP, JERKY, MOVING = 1.2, 1.3, 0.02  # radians a frame; change of a frame's turns to these; radians a frame
 BACKWARDS, SIDEWAYS, TWISTED = 15.0, 40.0, 60.0  # degrees, medians over the frames
 
 
@@ -119,6 +121,9 @@ def check_travel(path: Path, places: np.ndarray, travel: np.ndarray, fps: float,
         near = min(METRES, key=lambda name: abs(np.log(METRES[name] / scale)))
         problem = f"expected translations in metres, feet stand still if their unit is {scale:.3g} m, which is {near}."
         raise DataError(path, problem, f"Give units={near} or, if they are in metres, units=m.")
+    if units is None and len(steps) >= 10 and explained > PLANTED and not 1 / SLIDING < scale < SLIDING:
+        message = "feet slide: they stand still if translations are multiplied by %.2f; are they in metres?"
+        log.warning(f"%s: {message}", path, scale)
     if units is None and speed > FASTEST:
         raise DataError(path, f"expected a pelvis slower than {FASTEST:g} m/s, it moves at {speed:.3g} m/s.", hint)
     if (rise := float(np.ptp(travel[:, 1]))) > RISE:
@@ -171,4 +176,25 @@ def check_joint_order(path: Path, poses: np.ndarray) -> None:
         log.warning(
             "%s: %s degrees (medians): expected joints in SMPL's order, left before right; look at the result.",
             *(path, ", ".join(faults)),
+        )
+
+
+def check_order(path: Path, poses: np.ndarray) -> None:
+    """Warns of poses ``(T, J, 3)`` that jump from frame to frame, as where frames are in another order or damaged."""
+    if len(poses) < 4:
+        return
+    turns = Rotation.from_rotvec(poses.reshape(-1, 3).astype(np.float64)).as_matrix().reshape(*poses.shape[:2], 9)
+    steps = np.diff(turns, axis=0)
+    sizes = np.linalg.norm(steps, axis=2) / np.sqrt(2)  # radians, where they are small
+    changes = np.linalg.norm(np.diff(steps, axis=0), axis=2) / np.sqrt(2)
+    moving, change = (float(np.median(values.mean(axis=1))) for values in (sizes, changes))
+    if moving > MOVING and change > JERKY * moving:
+        log.warning(
+            "%s: joints turn to and fro from frame to frame (%.2f times what they turn by): are frames in their order?",
+            *(path, change / moving),
+        )
+    elif (jumps := np.flatnonzero(sizes.max(axis=1) > JUMP)).size:
+        log.warning(
+            "%s: joints jump by up to %.1f radians between %d frames, first after frame %d: look at the result.",
+            *(path, sizes.max(), len(jumps), jumps[0]),
         )

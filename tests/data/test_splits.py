@@ -1,5 +1,6 @@
 """Held-back frames, fractions and leakage."""
 
+import re
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from avatar.checks import AvatarError
-from avatar.data.splits import SplitConfig, check_leakage, sequence_of, split_frames, split_outfit
+from avatar.data.splits import SplitConfig, check_copies, check_leakage, sequence_of, split_frames, split_outfit
 
 
 def frames(**sequences):
@@ -80,3 +81,25 @@ def test_held_back_frames_are_a_split_of_their_own(tiny_outfit):
         tiny_outfit.with_validation(("dance.00001",))
     with pytest.raises(AvatarError, match="validation where frames were held back"):
         tiny_outfit.frames("validation")
+
+
+def packed(folder, **scans):
+    """An outfit of files with scans, by path."""
+    names = {}
+    for path, scan in scans.items():
+        split, _, name = path.partition("_")
+        names.setdefault(split, []).append(name)
+        (folder / split).mkdir(exist_ok=True)
+        np.savez(folder / split / f"{name}.npz", scan_pc=np.full((5, 3), scan), scan_name=np.array(name))
+    return SimpleNamespace(name="x", path=folder, frames=names.get, has_frames=names.__contains__)
+
+
+def test_copies_of_scans_are_found_whatever_their_names(tmp_path, caplog):
+    check_copies(packed(tmp_path, train_a=1.0, train_b=2.0, test_c=3.0))
+    assert caplog.text == ""
+    check_copies(packed(tmp_path, train_a=1.0, train_b=1.0, train_d=1.0, test_c=3.0))
+    assert re.search(
+        r"2 train frames have the scan of another .*train/b = train/a, train/d = train/a.*once more", caplog.text
+    )
+    with pytest.raises(AvatarError, match=r"1 test frames have the scan of another frame of train .test/c = train/b"):
+        check_copies(packed(tmp_path, train_a=1.0, train_b=2.0, test_c=2.0))

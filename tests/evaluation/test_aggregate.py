@@ -53,8 +53,8 @@ def test_two_rows_for_one_number_are_refused():
 
 
 def test_floors_come_first():
-    names = ["pop", "static (s1)", "closet", "body", "sampling (halves)"]
-    assert order_methods(names) == ["sampling (halves)", "body", "static (s1)", "closet", "pop"]
+    names = ["pop", "static (s1)", "closet", "body", "sampling (mesh)"]
+    assert order_methods(names) == ["sampling (mesh)", "body", "static (s1)", "closet", "pop"]
 
 
 def test_interval_holds_the_truth_about_as_often_as_it_says():

@@ -1,9 +1,11 @@
 """The sampling and body floors on spheres."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from avatar.checks import AvatarError
 from avatar.evaluation.scoring import ScoreConfig, measure_floors, sample_body
@@ -36,13 +38,32 @@ def test_sampling_floor_is_the_spacing_of_random_points(ball):
     assert "jitter" not in values(scores)  # its points are drawn anew each frame
 
 
-def test_sampling_floor_from_halves_is_marked(ball_without_truth, caplog):
+def test_scans_that_are_points_have_no_sampling_floor(ball_without_truth, caplog):
     with caplog.at_level(logging.WARNING):
-        scores = measure_floors(ball_without_truth, "test", CONFIG, 3000).only("method", ["sampling"])
-    assert {row.variant for row in scores.rows} == {"halves"}
-    assert {row.points for row in scores.rows} == {1500}
-    assert values(scores)["cd_point"] == pytest.approx(2 * 4 / 1500, rel=0.1)
-    assert "halves" in caplog.text
+        scores = measure_floors(ball_without_truth, "test", CONFIG, 3000)
+    assert {row.method for row in scores.rows} == {"body"}
+    assert (
+        "ball: there is no sampling floor, and no excess over it: the scan of reach.0007 has no scan_faces"
+        in caplog.text
+    )
+
+
+def test_scans_that_are_meshes_are_sampled_again(ball_without_truth):
+    load = ball_without_truth.load
+
+    def meshed(split, name):
+        frame = load(split, name)
+        faces = ConvexHull(frame.scan.points).simplices
+        corners = frame.scan.points[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        inward = (normals * corners[:, 0]).sum(axis=1) < 0
+        faces[inward] = faces[inward][:, ::-1]
+        return replace(frame, scan=replace(frame.scan, faces=faces.astype(np.int64)))
+
+    ball_without_truth.load = meshed
+    scores = measure_floors(ball_without_truth, "test", CONFIG, 6000).only("method", ["sampling"])
+    assert {(row.variant, row.points) for row in scores.rows} == {("mesh", 6000)}
+    assert values(scores)["cd_point"] == pytest.approx(4 / 6000 + 4 / 3000, rel=0.1)
 
 
 def test_a_sampling_that_is_not_independent_is_refused(ball):

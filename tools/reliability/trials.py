@@ -30,6 +30,7 @@ from reliability.nan_injection import nan_trial
 from reliability.offline import network_trial
 from reliability.payloads import payload_trial
 from reliability.races import race_trial
+from reliability.spoilt_data import spoilt_trial
 from reliability.streaming import stream_trial
 
 log = logging.getLogger(__name__)
@@ -81,6 +82,7 @@ TRIALS: dict[str, tuple[tuple[str, ...], Callable[[ReliabilityConfig, Path], lis
     "bombs": ((), lambda c, root: bomb_trial(root)),
     "payloads": ((), lambda c, root: payload_trial(root)),
     "names": (("names",), lambda c, root: name_trial(root, c.names, c.seed)),
+    "spoilt": ((), lambda c, root: spoilt_trial(root, c.out)),
     "mesh": (("meshes",), lambda c, root: mesh_trial(c.meshes)),
     "stream": (("stream_gb", "stream_frames"), lambda c, root: stream_trial(root, c.stream_gb, c.stream_frames)),
     "network": (("demo_minutes",), lambda c, root: network_trial(root, c.demo_minutes)),
@@ -91,7 +93,8 @@ TRIALS: dict[str, tuple[tuple[str, ...], Callable[[ReliabilityConfig, Path], lis
 def check_reliability(config: ReliabilityConfig) -> Path:
     """Runs the chosen trials that are not finished yet; returns the table, ``<out>/reliability.md``.
 
-    ``reliability.csv`` is written beside it. Trials finished earlier, with whatever sizes, keep their rows.
+    ``reliability.csv`` is written beside it, ``spoilt_data.md`` by the trial ``spoilt``. Trials finished earlier, with
+    whatever sizes, keep their rows.
 
     Raises:
         AvatarError: at the end, when a finding missed its goal, naming the first.
