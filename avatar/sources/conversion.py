@@ -29,7 +29,7 @@ from avatar.io.locks import lock_folder
 from avatar.io.meshes import write_mesh
 from avatar.io.npz import write_arrays, write_whole
 from avatar.io.points import color_bytes
-from avatar.io.raw_surface import vertex_normals
+from avatar.io.raw_surface import RawSurface, vertex_normals
 from avatar.progress import tracked
 from avatar.records import Frame, Mesh, Template
 from avatar.settings import settings_to_dict
@@ -209,14 +209,15 @@ def packed_arrays(source: Source, frame: SourceFrame, points: int | None) -> dic
 def scan_arrays(posed: PosedScan, body: Mesh | None, points: int | None, name: str) -> dict[str, np.ndarray | None]:
     """A scan's arrays: as it is, or as ``points`` spread evenly over its mesh or taken from its points.
 
-    Normals that are missing are the mesh's, or estimated from the points and oriented by the posed ``body``.
-    What is drawn follows from the frame's name alone.
+    Normals that are missing are the mesh's, or estimated from the points and oriented by the posed ``body``. Vertices
+    of a mesh that no face with area gives one are left out. What is drawn follows from the frame's name alone.
     """
     scan, labels = posed.scan, posed.labels
     normals = scan.normals
     if normals is None:
         if scan.faces is not None:
             normals = vertex_normals(scan.vertices, scan.faces)
+            scan, normals, labels = _without_loose_vertices(scan, normals, labels)
         else:
             normals = oriented_normals(scan.vertices, body, name)
     arrays = {"scan_pc": scan.vertices, "scan_n": normals, "scan_labels": labels, "scan_colors": scan.colors}
@@ -239,6 +240,19 @@ def scan_arrays(posed: PosedScan, body: Mesh | None, points: int | None, name: s
     if arrays["scan_colors"] is not None:
         arrays["scan_colors"] = color_bytes(arrays["scan_colors"])
     return arrays
+
+
+def _without_loose_vertices(
+    scan: RawSurface, normals: np.ndarray, labels: np.ndarray | None
+) -> tuple[RawSurface, np.ndarray, np.ndarray | None]:
+    """A mesh, its normals ``(V, 3)`` and labels ``(V,)`` without vertices whose normal is 0, and the faces at them."""
+    kept = normals.any(axis=1)
+    if kept.all():
+        return scan, normals, labels
+    faces = (np.cumsum(kept) - 1)[scan.faces[kept[scan.faces].all(axis=1)]]
+    colors = None if scan.colors is None else scan.colors[kept]
+    whole = replace(scan, vertices=scan.vertices[kept], faces=faces, colors=colors)
+    return whole, normals[kept], None if labels is None else labels[kept]
 
 
 def posed_body(source: Source, posed: PosedScan) -> Mesh | None:

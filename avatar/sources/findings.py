@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from avatar.checks import AvatarError
+from avatar.data.alignment import measure_overlap
 from avatar.data.folders import SPLITS
 from avatar.data.outfits import Outfit
+from avatar.data.scan_validation import check_frame
 from avatar.data.splits import spaced_frames
-from avatar.data.validation import measure_overlap
 from avatar.geometry.orientation import measure_winding
 from avatar.geometry.trees import build_tree
 from avatar.io.ledger import file_digest
@@ -22,8 +24,8 @@ from avatar.records import Frame, Template
 from avatar.sources.conversion import UnfittedError
 
 REACH = 0.10  # metres from the skin within which cloth is expected but for skirts and hoods
-STRAY = 0.5  # metres from the skin beyond which a point is no part of the person
 BARE = 0.5  # share of a joint's skin without a scan point near from which on the part is called uncovered
+SHOWN = 5  # doubtful frames in the text
 NEAR_POSE = 0.05  # radians, the largest difference of a joint, below which two frames have one pose
 
 
@@ -32,8 +34,8 @@ class FrameFinding:
     """One frame measured, or why it is refused.
 
     Shares are of 1: ``covered`` of the skin with a scan point near, ``buried`` of the scan deep inside, ``outward`` of
-    its normals, ``stray`` of its points far from the body; ``uncovered`` names joints whose skin has no scan near. A
-    scan that is not ``fitted`` has none of these; ``against`` is the share of its faces wound against the others.
+    its normals; ``uncovered`` names joints whose skin has no scan near, ``doubts`` is what loading warns of. A scan
+    that is not ``fitted`` has none of these; ``against`` is the share of its faces wound against the others.
     """
 
     split: str
@@ -44,9 +46,9 @@ class FrameFinding:
     covered: float = 0.0
     buried: float = 0.0
     outward: float = 0.0
-    stray: float = 0.0
     height: float = 0.0
     uncovered: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     fitted: bool = True
     against: float = 0.0
 
@@ -84,15 +86,15 @@ def measure_outfit(outfit: Outfit, most: int | None = None) -> Findings:
         except AvatarError as error:
             found.append(FrameFinding(split, name, str(error)))
             continue
-        found.append(measure_frame(frame, outfit.template))
+        found.append(measure_frame(frame, outfit.template, outfit.frame_path(split, name)))
         if frame.body.pose is not None:
             poses[split].append((f"{split}/{name}", frame.body.pose))
     copies = tuple(tuple(same) for same in digests.values() if len(same) > 1)
     return Findings(tuple(found), sizes, copies, tuple(leaked_poses(poses)))
 
 
-def measure_frame(frame: Frame, template: Template) -> FrameFinding:
-    """Measures one valid frame."""
+def measure_frame(frame: Frame, template: Template, path: Path) -> FrameFinding:
+    """Measures one valid frame of a file."""
     scan, body = frame.scan, frame.body.vertices
     overlap = measure_overlap(scan.points, scan.normals, body, template.faces.numpy())
     return FrameFinding(
@@ -103,7 +105,7 @@ def measure_frame(frame: Frame, template: Template) -> FrameFinding:
         covered=overlap.covered,
         buried=overlap.buried,
         outward=overlap.outward,
-        stray=float((build_tree(body).query(scan.points)[0] > STRAY).mean()),
+        doubts=tuple(check_frame(frame, template, path).values()),
         height=float(np.ptp(scan.points[:, 1])),
         uncovered=uncovered_joints(scan.points, body, template),
     )
@@ -163,11 +165,10 @@ def describe(findings: Findings) -> list[str]:
             f"scan deep inside the body: {_range((frame.buried for frame in fitted), '.1%')}",
             f"normals that point outward: {_range((frame.outward for frame in fitted), '.0%')}",
         ]
-        worst = max(fitted, key=lambda frame: frame.stray)
-        if worst.stray:
-            lines.append(
-                f"points farther than {STRAY} m from the body: {worst.stray:.1%} in {worst.split}/{worst.name}"
-            )
+        doubtful = [frame for frame in fitted if frame.doubts]
+        lines += [f"doubtful: {frame.split}/{frame.name}: {' '.join(frame.doubts)}" for frame in doubtful[:SHOWN]]
+        if len(doubtful) > SHOWN:
+            lines.append(f"doubtful: {len(doubtful) - SHOWN} more frames; out=check.csv has them all")
         bare = Counter(joint for frame in fitted for joint in frame.uncovered)
         for joint, count in bare.most_common():
             lines.append(f"without a scan: {joint} in {count} of {len(fitted)} frames")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from avatar.body.open import MEAN_SHAPE, open_body
 from avatar.body.solving import posed_vertices
 from avatar.checks import DataError
-from avatar.data.validation import measure_overlap, suggest_hint
+from avatar.data.alignment import measure_overlap, suggest_hint
 from avatar.geometry.trees import Tree, build_tree
 from avatar.geometry.units import METRES, possible_units
 from avatar.io.stance import UPRIGHT, Y_FROM

@@ -23,6 +23,7 @@ from avatar.data.folders import SPLITS
 from avatar.data.packed_layout import PackedOutfit
 from avatar.export.meshing import PoissonConfig
 from avatar.io.meshes import write_mesh
+from avatar.io.raw_surface import vertex_normals
 from avatar.methods.settings import MethodChoice, RunConfig
 from avatar.runs.training import train
 from avatar.simulate.angles import authored_motion
@@ -106,13 +107,18 @@ def test_the_layout_is_found_by_its_files(converted):
     assert (one[0].layout, one[0].name, one[0].frames) == (layout, sources[0].name, sources[0].frames)
 
 
-def test_scans_and_bodies_are_the_same_after_conversion(converted):
+def test_scans_and_bodies_are_the_same_after_conversion(converted, person):
+    """But for vertices of a mesh whose faces cancel out: they have no normal, and are left out."""
     _, truth, _, outfits = converted
     seen = set()
     for outfit, split, name in frames_of(outfits):
         key = next(key for key in (name, f"{split}/{name}", f"{outfit.name}/{name}") if key in truth)
         frame = outfit.load(split, name)
-        np.testing.assert_allclose(frame.scan.points, truth[key].scan, rtol=0, atol=MICROMETRE)
+        whole = truth[key].scan
+        if frame.scan.faces is not None:
+            whole = whole[vertex_normals(whole, person["f"].astype(np.int64)).any(axis=1)]
+            assert len(whole) > 0.99 * len(truth[key].scan)
+        np.testing.assert_allclose(frame.scan.points, whole, rtol=0, atol=MICROMETRE)
         np.testing.assert_allclose(frame.body.vertices, truth[key].body, rtol=0, atol=MICROMETRE)
         np.testing.assert_allclose(frame.body.pose[:22], truth[key].pose, rtol=0, atol=MICROMETRE)
         posed = outfit.fit_pose(frame.body.pose, frame.body.translation)
