@@ -136,6 +136,23 @@ def test_cloth_outside_the_skin_does_not_make_the_body_larger(clothed, clothing)
     assert abs(growth) < 0.15 if clothing else growth > 0.3
 
 
+def test_the_scan_in_minimal_clothing_gives_everyone_s_shape(clothed, monkeypatch):
+    """It is taken for skin; a shape that is given is kept, and nothing estimated."""
+    family, pose, (cloud, _) = clothed
+    bare, _ = scan_of(family.body(family.mean), pose)
+    seen, fit_shape = [], Registration.fit_shape
+
+    def noted(self, scans, fit):
+        seen.append((self.config.clothing, len(scans)))
+        return fit_shape(self, scans, fit)
+
+    monkeypatch.setattr(Registration, "fit_shape", noted)
+    found = fit_subject([cloud, bare], family, quick_config(), minimal=[1], progress=False)
+    assert seen == [(False, 1)] and abs(found.shape["beta0"]) < 0.2
+    given = fit_subject([bare], family, quick_config(), shape=[0.5], progress=False)
+    assert given.shape == {"beta0": 0.5} and len(seen) == 1
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
