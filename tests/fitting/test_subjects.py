@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from avatar.body.families import fixed_family, smpl_family
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
+from avatar.fitting.matching import Registration, prepare_samples
 from avatar.fitting.posing import Fit, PosedFamily
-from avatar.fitting.registration import Registration, prepare_samples
 from avatar.fitting.settings import FittingConfig, StageConfig
 from avatar.fitting.subjects import fit_subject
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
