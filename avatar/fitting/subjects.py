@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from avatar.body.families import BodyFamily
 from avatar.body.model import BodyModel
 from avatar.checks import AvatarError
+from avatar.fitting.matching import BARE, Registration, ScanSamples, check_scan, prepare_samples
 from avatar.fitting.posing import Fit, PosedFamily, join_fits
 from avatar.fitting.quality import FitQuality, measure_fit
-from avatar.fitting.registration import BARE, Registration, ScanSamples, check_scan, prepare_samples
 from avatar.fitting.settings import FittingConfig
 from avatar.io.ledger import Ledger, digest_of, keyed
 from avatar.progress import tracked
@@ -106,7 +106,7 @@ class Subject:
     ):
         self.scans, self.names, self.family, self.config = scans, names, family, config
         self.ledger, self.progress = ledger, progress
-        self.registration = Registration(family, config)
+        self.matcher = Registration(family, config)
         self.known: dict[int, Fit] = {}  # of the scans that the shape was estimated from, each in its own shape
         self.key = keyed(SOURCE, config=asdict(config), family=family_digest(family))
         bare = [family.bind.joint_names.index(name) for name in BARE]
@@ -125,13 +125,13 @@ class Subject:
         count = min(self.config.shape_frames, len(self.scans))
         numbers = list(minimal) or np.linspace(0, len(self.scans) - 1, count).round().astype(int).tolist()
         clothing = self.config.clothing and not minimal
-        registration = Registration(self.family, replace(self.config, clothing=clothing))
+        matcher = Registration(self.family, replace(self.config, clothing=clothing))
         fits, kept, costs, prints = [], [], [], []
         for number in tracked(numbers, "fit the shape", "scan", silent=not self.progress):
             cloud, samples = self.load(number)
             prints.append(cloud_digest(cloud))
             made_of = {"clothing": clothing, "scan": prints[-1]}
-            fit, cost = self._once(f"start/{self.names[number]}", made_of, partial(registration.fit_one, samples))
+            fit, cost = self._once(f"start/{self.names[number]}", made_of, partial(matcher.fit_one, samples))
             fits.append(fit)
             self.known[number] = fit
             kept.append(samples)
@@ -139,7 +139,7 @@ class Subject:
         good = [i for i, cost in enumerate(costs) if cost <= 2 * float(np.median(costs))]
         made_of = {"clothing": clothing, "scans": prints, "numbers": numbers}
         scans, starts = [kept[i] for i in good], join_fits([fits[i] for i in good])
-        fit, _ = self._once("shape", made_of, lambda: (registration.fit_shape(scans, starts)[:1], 0.0))
+        fit, _ = self._once("shape", made_of, lambda: (matcher.fit_shape(scans, starts)[:1], 0.0))
         return fit.shape[0]
 
     def fit_poses(self, shape: torch.Tensor) -> SubjectFit:
@@ -167,10 +167,10 @@ class Subject:
     ) -> tuple[Fit, float]:
         """The fit from a start, or from all of them where there is none or it leads nowhere."""
         if start is not None:
-            found = self.registration.fit_one(samples, shape, start)
+            found = self.matcher.fit_one(samples, shape, start)
             if not self._measured("", cloud, *found).failed:
                 return found
-        return self.registration.fit_one(samples, shape)
+        return self.matcher.fit_one(samples, shape)
 
     def _measured(self, name: str, cloud: PointCloud, fit: Fit, objective: float) -> FrameFit:
         """A fit with its quality."""

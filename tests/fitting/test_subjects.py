@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from avatar.body.families import fixed_family, smpl_family
 from avatar.body.open import open_body
 from avatar.checks import AvatarError
+from avatar.fitting.matching import Registration, prepare_samples
 from avatar.fitting.posing import Fit, PosedFamily
-from avatar.fitting.registration import Registration, prepare_samples
 from avatar.fitting.settings import FittingConfig, StageConfig
 from avatar.fitting.subjects import fit_subject
 from avatar.geometry.surface import interpolate, sample_surface, vertex_normals
@@ -134,6 +134,23 @@ def test_cloth_outside_the_skin_does_not_make_the_body_larger(clothed, clothing)
         fit, _ = Registration(family, config).fit_one(prepare_samples(cloud, config), start=start)
     growth = float(fit.shape)  # of the size, 3% a standard deviation
     assert abs(growth) < 0.15 if clothing else growth > 0.3
+
+
+def test_the_scan_in_minimal_clothing_gives_everyone_s_shape(clothed, monkeypatch):
+    """It is taken for skin; a shape that is given is kept, and nothing estimated."""
+    family, pose, (cloud, _) = clothed
+    bare, _ = scan_of(family.body(family.mean), pose)
+    seen, fit_shape = [], Registration.fit_shape
+
+    def noted(self, scans, fit):
+        seen.append((self.config.clothing, len(scans)))
+        return fit_shape(self, scans, fit)
+
+    monkeypatch.setattr(Registration, "fit_shape", noted)
+    found = fit_subject([cloud, bare], family, quick_config(), minimal=[1], progress=False)
+    assert seen == [(False, 1)] and abs(found.shape["beta0"]) < 0.2
+    given = fit_subject([bare], family, quick_config(), shape=[0.5], progress=False)
+    assert given.shape == {"beta0": 0.5} and len(seen) == 1
 
 
 @pytest.mark.parametrize(
