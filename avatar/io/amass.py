@@ -24,6 +24,7 @@ WHOLE = ("poses", "fullpose", "pose")  # all joints, the root first
 PARTS = (("root_orient", "pose_body"), ("global_orient", "body_pose"), ("Rh", "poses"))  # root, others
 TRANSLATIONS = ("trans", "transl", "Th")
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate")
+HANDS = ("left_hand_pose", "right_hand_pose", "hand_pose", "pose_hand", "jaw_pose", "pose_jaw")
 SHAPES = ("betas", "shapes", "shape", "beta")
 KEYS = tuple(dict.fromkeys((*WHOLE, *sum(PARTS, ()), *TRANSLATIONS)))
 UNIT_TOLERANCE = 1e-2  # of the lengths of quaternions and of rows of matrices
@@ -81,6 +82,11 @@ def read_betas(path: Path) -> np.ndarray | None:
     """Shape coefficients ``(T, B)`` or ``(1, B)`` in a file of `read_smpl_arrays`; None where it has none."""
     found = _read_keys(path, SHAPES)
     return next((_frames(path, key, array) for key, array in found.items()), None)
+
+
+def poses_hands(path: Path) -> bool:
+    """Whether a file of `read_smpl_arrays` turns hands or face under keys of their own, which that does not read."""
+    return any(np.any(array) for array in _read_keys(path, HANDS).values())
 
 
 def _read_keys(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:

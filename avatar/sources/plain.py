@@ -16,7 +16,7 @@ from avatar.body.registry import body_of_file
 from avatar.body.solving import PoseSolver, posed_vertices
 from avatar.checks import DataError, plain_name
 from avatar.invocation import command_line, option
-from avatar.io.amass import SmplArrays, read_betas, read_smpl_arrays
+from avatar.io.amass import SmplArrays, poses_hands, read_betas, read_smpl_arrays
 from avatar.io.joint_names import INDEX, map_joints
 from avatar.io.motions import move_body
 from avatar.io.npz import read_arrays
@@ -309,12 +309,20 @@ class PlainScans(Source):
                 self._kept.clear()
             parameters = self._arrays[path] == "parameters"
             joints = len(self.body.parents)
+            if parameters and not self._hands and poses_hands(path):
+                self._hands.append(path)
+                log.warning("%s: hands and face of body parameters are laid at rest.", path)
             self._kept[path] = read_smpl_arrays(path, self._pelvis, joints) if parameters else _read_vertices(path)
         return self._kept[path]
 
     @cached_property
     def _kept(self) -> dict[Path, SmplArrays | np.ndarray]:
         return {}
+
+    @cached_property
+    def _hands(self) -> list[Path]:
+        """The first file whose hands were left out, once that was said."""
+        return []
 
     @cached_property
     def _placement(self) -> Placement:

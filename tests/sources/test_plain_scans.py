@@ -199,6 +199,16 @@ def test_a_shape_beside_the_parameters(person, tmp_path, caplog):
     assert "shape coefficients differ by" in caplog.text
 
 
+def test_hands_that_are_left_out_are_warned_of_once(frames, parameters, template, tmp_path, caplog):
+    folder = write_scans(tmp_path / "scans", frames)
+    count = len(frames)
+    np.savez(folder / "p.npz", **parameters, left_hand_pose=np.full((count, 12), 0.3), jaw_pose=np.zeros((count, 3)))
+    source = opened(folder, body=SourceBody(template))
+    for frame in source.frames:
+        assert source.read(frame).fitted
+    assert caplog.text.count("hands and face of body parameters are laid at rest") == 1
+
+
 def test_scans_without_bodies(frames, tmp_path):
     folder = write_scans(tmp_path / "scans", frames, up="z", scale=1000)
     source = opened(folder)
