@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,6 +20,7 @@ from avatar.fitting.settings import FittingConfig
 from avatar.fitting.subjects import SubjectFit, fit_subject
 from avatar.io.ledger import Ledger, digest_of
 from avatar.io.locks import lock_folder
+from avatar.io.raw_surface import RawSurface
 from avatar.progress import tracked
 from avatar.records import PointCloud
 from avatar.sources.base import PosedScan, Source, SourceFrame
@@ -31,6 +33,7 @@ from avatar.sources.conversion import (
     scan_arrays,
 )
 
+log = logging.getLogger(__name__)
 SAMPLES = 40_000  # points that a body is registered to, of scans with more
 
 
@@ -44,17 +47,27 @@ class FitScansConfig(ConvertConfig):
 
 
 class Clouds(Sequence):
-    """The oriented points of a source's frames, read when they are asked for."""
+    """The oriented points of a source's frames, read when they are asked for.
 
-    def __init__(self, source: Source, frames: Sequence[SourceFrame]):
-        self.source, self.frames = source, frames
+    ``bare`` takes those of the meshes of another model's bodies under the scans instead. Raises `DataError` for a frame
+    without one.
+    """
+
+    def __init__(self, source: Source, frames: Sequence[SourceFrame], bare: bool = False):
+        self.source, self.frames, self.bare = source, frames, bare
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __getitem__(self, number: int) -> PointCloud:
         frame = self.frames[number]
-        arrays = scan_arrays(self.source.read(frame), None, SAMPLES, frame.name)
+        posed = self.source.read(frame)
+        if self.bare:
+            mesh = self.source.body_mesh(frame)
+            if mesh is None:
+                raise DataError(frame.files[0], "expected the mesh of a body, as other frames have one, there is none.")
+            posed = PosedScan(RawSurface(frame.files[0], mesh.vertices, mesh.faces))
+        arrays = scan_arrays(posed, None, SAMPLES, frame.name)
         return PointCloud(arrays["scan_pc"], arrays["scan_n"])
 
 
@@ -100,7 +113,8 @@ def family_of(config: ConvertConfig) -> BodyFamily:
 def register(source: Source, config: FitScansConfig, ledger: Ledger) -> RegisteredSource:
     """Fits one body to a source's scans (`fit_subject`); finished scans are kept in ``ledger``.
 
-    Raises `AvatarError` for frames of ``minimal`` that are not there; otherwise errors as `fit_subject`.
+    Where meshes of a body of another model lie under the scans, it is fitted to those, skin to skin. Raises
+    `AvatarError` for frames of ``minimal`` that are not there; otherwise errors as `fit_subject`.
     """
     frames = chosen_frames(source, config)
     names = [frame.name for frame in frames]
@@ -108,8 +122,11 @@ def register(source: Source, config: FitScansConfig, ledger: Ledger) -> Register
         if name not in names:
             raise unknown_name("minimal", name, names[:20])
     minimal = [names.index(name) for name in config.minimal]
-    shape = config.body.betas or None
-    fit = fit_subject(Clouds(source, frames), family_of(config), config.fitting, names, minimal, shape, ledger)
+    shape, fitting = config.body.betas or None, config.fitting
+    if bare := source.body is None and source.body_mesh(frames[0]) is not None:
+        fitting = replace(fitting, clothing=False)
+        log.info("%s: the body is fitted to the bodies' meshes under the scans.", source.path)
+    fit = fit_subject(Clouds(source, frames, bare), family_of(config), fitting, names, minimal, shape, ledger)
     return RegisteredSource(source, frames, fit)
 
 

@@ -11,10 +11,12 @@ from avatar.checks import AvatarError, DataError
 from avatar.data.layouts import open_outfit_folder
 from avatar.fitting.quality import FitQuality
 from avatar.fitting.subjects import FrameFit, SubjectFit
+from avatar.geometry.trees import build_tree
 from avatar.io.ledger import Ledger
+from avatar.io.meshes import write_mesh
 from avatar.io.points import write_points
 from avatar.pipeline.intake import CheckConfig, InfoConfig, data_check, data_convert, data_fit, data_info
-from avatar.records import PointCloud
+from avatar.records import Mesh, PointCloud
 from avatar.sources import registered
 from avatar.sources.conversion import ConvertConfig
 from avatar.sources.registered import FitScansConfig, family_of
@@ -145,6 +147,34 @@ def test_fit_writes_the_fitted_body_its_report_and_leaves_failed_frames_out(
     assert len(list((folder / "fits").glob("*.png"))) == 1
     with pytest.raises(AvatarError, match=r"minimal: expected one of scan\.0, "):
         data_fit(replace(config, minimal=["scan_1"]))
+
+
+def test_a_body_is_fitted_to_the_meshes_of_another_models_bodies(scans, tiny_outfit, tmp_path, monkeypatch):
+    """Their skin is what is fitted, not the cloth of the scans over it; a frame without one is named."""
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    faces = tiny_outfit.template.faces.numpy()
+    for number, name in enumerate(tiny_outfit.frames("train")[:3]):
+        (folder / f"scan_{number}.ply").write_bytes((scans / f"bare/scan_{number}.ply").read_bytes())
+        body = Mesh(1000 * tiny_outfit.load_body("train", name).vertices, faces[:, [1, 2, 0]])
+        write_mesh(folder / f"scan_{number}_smpl.obj", body)
+    seen = []
+
+    def fit_subject(clouds, family, config, *others):
+        seen.append(config.clothing)
+        true = tiny_outfit.load_body("train", tiny_outfit.frames("train")[1]).vertices
+        gaps = build_tree(true).query(clouds[1].points)[0]
+        assert len(gaps) == registered.SAMPLES and np.median(gaps) < 0.01 and gaps.max() < 0.05
+        raise AvatarError("stopped here")
+
+    monkeypatch.setattr(registered, "fit_subject", fit_subject)
+    monkeypatch.setattr(registered, "family_of", lambda config: None)
+    for missing in (False, True):
+        if missing:
+            (folder / "scan_1_smpl.obj").unlink()
+        with pytest.raises(AvatarError, match="scan_1.*expected the mesh of a body" if missing else "stopped here"):
+            data_fit(FitScansConfig(source=folder, data_root=tmp_path / "data", name="coat"))
+    assert seen == [False, False]
 
 
 def test_the_family_that_is_fitted_follows_from_the_body_file(scans, person_folder):
