@@ -367,16 +367,16 @@ def copy_program(folder: Path) -> Path:
 
 
 def write_scans(outfit: OpenOutfit, folder: Path) -> None:
-    """Four scans of an outfit with a body and parameters beside them, ``coat``, and three in mm, ``unfitted``."""
+    """Four scans of an outfit with a body and parameters beside them, ``coat``, and six in mm, ``unfitted``."""
     write_body(folder / "coat/template.npz", outfit.body)
-    for number, name in enumerate(outfit.frames("train")[:4]):
+    for number, name in enumerate(outfit.frames("train")[:6]):
         frame = outfit.load("train", name)
         points, normals = frame.scan.points[::10], frame.scan.normals[::10]
-        write_points(folder / f"coat/scan_{number}.ply", PointCloud(points, normals))
-        fit = {"poses": frame.body.pose.reshape(1, -1), "trans": frame.body.translation[None]}
-        np.savez(folder / f"coat/scan_{number}.npz", **fit)
-        if number < 3:
-            write_points(folder / f"unfitted/{number}.ply", PointCloud(1000 * points, normals))
+        write_points(folder / f"unfitted/{number}.ply", PointCloud(1000 * points, normals))
+        if number < 4:
+            write_points(folder / f"coat/scan_{number}.ply", PointCloud(points, normals))
+            fit = {"poses": frame.body.pose.reshape(1, -1), "trans": frame.body.translation[None]}
+            np.savez(folder / f"coat/scan_{number}.npz", **fit)
 
 
 def prepare_workspace(folder: Path, program: Path) -> Path:

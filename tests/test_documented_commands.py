@@ -59,12 +59,12 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         "python tools/train.py outfit=dress method=layered",
         "python tools/predict.py run=runs/layered/sample/dress/default motion=walk.npz fps=15",
         "python tools/mesh.py run=runs/layered/sample/dress/default predictions=walk",
-        "python tools/data.py fit source=scans/unfitted dataset=mine name=jacket",
-        "python tools/canonicalize.py dataset=mine outfit=jacket",
-        "python tools/template.py dataset=mine outfit=jacket",
-        "python tools/train.py dataset=mine outfit=jacket method=layered train.minutes=15",
-        "python tools/predict.py run=runs/layered/mine/jacket/default motion=walk.npz",
-        "python tools/mesh.py run=runs/layered/mine/jacket/default predictions=walk",
+        "python tools/data.py fit source=scans/unfitted dataset=own name=jacket",
+        "python tools/canonicalize.py dataset=own outfit=jacket",
+        "python tools/template.py dataset=own outfit=jacket",
+        "python tools/train.py dataset=own outfit=jacket method=layered train.minutes=15",
+        "python tools/predict.py run=runs/layered/own/jacket/default motion=walk.npz",
+        "python tools/mesh.py run=runs/layered/own/jacket/default predictions=walk",
     ),
     (
         "python tools/experiment.py experiment=closet5",
@@ -175,7 +175,8 @@ def test_every_line_is_run_or_named_with_its_reason():
     left = {command: unfilled(command) for command in RUN if unfilled(command)}
     assert left == {}, "give these a value in documented.FILLED, or name the line in NOT_RUN"
     verbs = {path.stem for path in (ROOT / "tools").glob("*.py")} - {"start"}
-    assert {verb_of(text) for text in texts} >= verbs, "a tool that no document tells how to start"
+    started = set(re.findall(r"tools/(\w+)\.py", " ".join(texts)))
+    assert started >= verbs, "a tool that no document tells how to start"
 
 
 def test_every_mention_of_a_tool_with_options_is_found():

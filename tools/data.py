@@ -2,8 +2,8 @@
 
 python tools/data.py info source=scans/coat
 python tools/data.py check source=scans/coat
-python tools/data.py convert source=scans/coat dataset=mine name=coat
-python tools/data.py fit source=scans/unfitted dataset=mine name=jacket
+python tools/data.py convert source=scans/coat dataset=own name=coat
+python tools/data.py fit source=scans/unfitted dataset=own name=jacket
 """
 
 from start import run
