@@ -56,9 +56,6 @@ PREPARED = (  # two series that run side by side before all else: runs, predicti
         "python tools/template.py outfit=dress",
         "python tools/train.py method=layered outfit=dress name=flowers scan.pattern=flowers train.steps=300 "
         "method.settings.pose=false",
-        "python tools/train.py outfit=dress method=layered",
-        "python tools/predict.py run=runs/layered/sample/dress/default motion=walk.npz fps=15",
-        "python tools/mesh.py run=runs/layered/sample/dress/default predictions=walk",
         "python tools/data.py fit source=scans/unfitted dataset=own name=jacket",
         "python tools/canonicalize.py dataset=own outfit=jacket",
         "python tools/template.py dataset=own outfit=jacket",
