@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from avatar.checks import AvatarError, check_range
+from avatar.checks import AvatarError, check_range, unknown_name
 from avatar.data.folders import SPLITS
 from avatar.data.layouts import open_outfit_folder
 from avatar.data.outfits import Outfit
 from avatar.environment import prepared_process
+from avatar.evaluation.scores import csv_text
 from avatar.io.npz import write_whole
 from avatar.sources.base import Source, SourceConfig
 from avatar.sources.conversion import ConvertConfig, SourceOutfit, UnfittedError, convert_outfit
@@ -110,6 +109,9 @@ def opened_outfits(config: SourceConfig) -> list[Outfit]:
         return [open_outfit_folder(path)]
     own = [folder for folder in sorted(path.glob("*/")) if (folder / "outfit.yaml").is_file()]
     if own and config.layout == "auto":
+        for name in config.outfits:
+            if name not in (known := [folder.name for folder in own]):
+                raise unknown_name("outfits", name, known)
         return [open_outfit_folder(folder) for folder in own if not config.outfits or folder.name in config.outfits]
     options = ConvertConfig(**{entry.name: getattr(config, entry.name) for entry in fields(SourceConfig)})
     return [SourceOutfit(source, options) for source in open_sources(config)]
@@ -148,12 +150,10 @@ def _body_facts(outfit: Outfit) -> str:
 
 def write_findings(path: Path, found: dict[str, Findings]) -> None:
     """Writes measures as CSV, a row a frame: its outfit, then the fields of `FrameFinding`."""
-    names, text = [entry.name for entry in fields(FrameFinding)], io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(["outfit", *names])
+    names, rows = [entry.name for entry in fields(FrameFinding)], []
     for outfit, findings in found.items():
         for frame in findings.frames:
             values = [getattr(frame, name) for name in names]
-            rows.writerow([outfit, *(" ".join(v) if isinstance(v, tuple) else v for v in values)])
+            rows.append([outfit, *(" ".join(v) if isinstance(v, tuple) else v for v in values)])
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, text.getvalue().encode())
+    write_whole(path, csv_text(["outfit", *names], rows).encode())

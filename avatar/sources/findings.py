@@ -146,7 +146,12 @@ def leaked_poses(poses: dict[str, list[tuple[str, np.ndarray]]]) -> Iterable[tup
 def describe(findings: Findings) -> list[str]:
     """Findings in lines: what is there, what is doubtful with the figure, what is refused."""
     valid = [frame for frame in findings.frames if not frame.problem]
-    lines = [f"frames: {', '.join(f'{count} {split}' for split, count in findings.sizes.items())}"]
+    seen = Counter(frame.split for frame in findings.frames)
+    looked = (
+        f"{count} {split}" + f" ({seen[split]} looked at)" * (seen[split] < count)
+        for split, count in findings.sizes.items()
+    )
+    lines = [f"frames: {', '.join(looked)}"]
     fitted = [frame for frame in valid if frame.fitted]
     if valid:
         lines += [
@@ -181,5 +186,6 @@ def describe(findings: Findings) -> list[str]:
 
 def _range(values: Iterable[float], form: str = ",") -> str:
     """Smallest to largest of the values, or the one there is."""
-    low, high = (format(bound, form) for bound in (lambda listed: (min(listed), max(listed)))(list(values)))
+    listed = list(values)
+    low, high = format(min(listed), form), format(max(listed), form)
     return low if low == high else f"{low} to {high}"

@@ -12,7 +12,7 @@ from avatar.body.families import BodyFamily, anny_family, fixed_family, smpl_fam
 from avatar.body.model import BodyModel
 from avatar.body.packed import holds_template
 from avatar.body.registry import body_of_file, canonical_pose
-from avatar.checks import DataError, unknown_name
+from avatar.checks import AvatarError, DataError, unknown_name
 from avatar.data.splits import spaced_frames
 from avatar.export.pictures import save_picture
 from avatar.fitting.quality import picture_fit, write_quality
@@ -107,7 +107,26 @@ def family_of(config: ConvertConfig) -> BodyFamily:
     path = config.body.path
     if path is None:
         return anny_family()
-    return fixed_family(body_of_file(path, {})) if holds_template(path) else smpl_family(path)
+    if path.suffix.lower() != ".npz" or holds_template(path):
+        return fixed_family(body_of_file(path, {}))
+    return smpl_family(path)
+
+
+def given_shape(config: ConvertConfig, family: BodyFamily) -> list[float] | None:
+    """The shape of ``body.betas``, those that are not given 0; None where none are.
+
+    Raises `AvatarError` for bodies without such a shape, or more numbers than the model has.
+    """
+    betas = list(config.body.betas)
+    if not betas:
+        return None
+    most = 0 if config.body.path is None else len(family.names)
+    if len(betas) > most:
+        hint = "Hint: leave them out to have the shape estimated; SMPL's betas need its model as body.path."
+        raise AvatarError(
+            f"body.betas: expected at most {most} numbers for the body that is fitted, got {len(betas)}. {hint}"
+        )
+    return betas + [0.0] * (most - len(betas))
 
 
 def register(source: Source, config: FitScansConfig, ledger: Ledger) -> RegisteredSource:
@@ -122,11 +141,12 @@ def register(source: Source, config: FitScansConfig, ledger: Ledger) -> Register
         if name not in names:
             raise unknown_name("minimal", name, names[:20])
     minimal = [names.index(name) for name in config.minimal]
-    shape, fitting = config.body.betas or None, config.fitting
+    family, fitting = family_of(config), config.fitting
     if bare := source.body is None and source.body_mesh(frames[0]) is not None:
         fitting = replace(fitting, clothing=False)
         log.info("%s: the body is fitted to the bodies' meshes under the scans.", source.path)
-    fit = fit_subject(Clouds(source, frames, bare), family_of(config), fitting, names, minimal, shape, ledger)
+    shape = given_shape(config, family)
+    fit = fit_subject(Clouds(source, frames, bare), family, fitting, names, minimal, shape, ledger)
     return RegisteredSource(source, frames, fit)
 
 

@@ -9,6 +9,7 @@ import pytest
 from avatar.body.packed import write_body
 from avatar.checks import AvatarError, DataError
 from avatar.data.layouts import open_outfit_folder
+from avatar.export.rigged import write_rigged_glb
 from avatar.fitting.quality import FitQuality
 from avatar.fitting.subjects import FrameFit, SubjectFit
 from avatar.geometry.trees import build_tree
@@ -19,7 +20,7 @@ from avatar.pipeline.intake import CheckConfig, InfoConfig, data_check, data_con
 from avatar.records import Mesh, PointCloud
 from avatar.sources import registered
 from avatar.sources.conversion import ConvertConfig
-from avatar.sources.registered import FitScansConfig, family_of
+from avatar.sources.registered import FitScansConfig, family_of, given_shape
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,13 @@ def test_check_measures_frames_and_names_those_that_are_refused(scans, tmp_path,
     assert "points a scan: 2,000" in text and "refused" not in text and len(rows) == 6
     assert all(float(row["covered"]) > 0.9 and row["outfit"] == "coat" for row in rows)
     data_check(CheckConfig(source=scans / "bare", frames=2))
-    assert "without a fitted body: 3 of 3 frames" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "without a fitted body: 3 of 3 frames" in text and "frames: 5 train (2 looked at), 1 test\n" in text
+
+
+def test_unknown_outfits_of_our_own_are_named(tiny_folder):
+    with pytest.raises(AvatarError, match="outfits: expected one of tiny, got 'tinny'"):
+        data_check(CheckConfig(source=tiny_folder.parent, outfits=["tinny"]))
 
 
 def test_check_finds_copies_leaks_and_parts_without_a_scan(tiny_outfit, tmp_path, capsys):
@@ -177,7 +184,19 @@ def test_a_body_is_fitted_to_the_meshes_of_another_models_bodies(scans, tiny_out
     assert seen == [False, False]
 
 
-def test_the_family_that_is_fitted_follows_from_the_body_file(scans, person_folder):
+def test_the_family_and_shape_that_are_fitted_follow_from_the_body_file(scans, person_folder, tiny_outfit, tmp_path):
     fixed = ConvertConfig(body=replace(ConvertConfig().body, path=scans / "coat" / "template.npz"))
     smpl = ConvertConfig(body=replace(ConvertConfig().body, path=person_folder / "template.npz"))
     assert family_of(fixed).names == () and len(family_of(smpl).names) > 0
+    rigged = tmp_path / "person.glb"
+    write_rigged_glb(rigged, tiny_outfit.body)
+    assert family_of(replace(fixed, body=replace(fixed.body, path=rigged))).names == ()
+    few = replace(smpl, body=replace(smpl.body, betas=[0.5]))
+    assert given_shape(smpl, family_of(smpl)) is None
+    assert given_shape(few, family_of(few)) == [0.5] + [0.0] * (len(family_of(few).names) - 1)
+    for config in (
+        ConvertConfig(body=replace(few.body, path=None)),
+        replace(fixed, body=replace(fixed.body, betas=[1.0])),
+    ):
+        with pytest.raises(AvatarError, match=r"body\.betas: expected at most 0 numbers .* got 1\. Hint: "):
+            given_shape(config, family_of(config))

@@ -198,7 +198,7 @@ SCANS = [
     ),
     ("moved by 10 cm", REFUSED, r"Moving it by \(-0\.10", moved(np.eye(3), (0.1, 0, 0))),
     ("moved by 50 cm", REFUSED, r"Moving it by \(-0\.(49|5)", moved(np.eye(3), (0.5, 0, 0))),
-    ("in another room", REFUSED, r"Moving it by \(-3\.\d\d, .*, -2\.\d\d\)", moved(np.eye(3), (3, 0, 2))),
+    ("moved by 3.6 m", REFUSED, r"Moving it by \(-3\.\d\d, .*, -2\.\d\d\)", moved(np.eye(3), (3, 0, 2))),
     ("moved by a translation in millimetres", REFUSED, "is the translation in metres", moved(np.eye(3), FAR_PLACE)),
     *(
         (
@@ -220,20 +220,12 @@ SCANS = [
     ),
     *(
         (
-            f"turned by 90 degrees about {axis}",
+            f"turned by {angle} degrees about {axis}",
             REFUSED,
-            f"Turning the scan by -90 degrees about {axis}",
-            moved(turn(axis, 90), about=True),
+            f"Turning the scan by {back} degrees about {axis}",
+            moved(turn(axis, angle), about=True),
         )
-        for axis in "xyz"
-    ),
-    *(
-        (
-            f"turned by 180 degrees about {axis}",
-            REFUSED,
-            f"Turning the scan by 180 degrees about {axis}",
-            moved(turn(axis, 180), about=True),
-        )
+        for angle, back in ((90, -90), (180, 180))
         for axis in "xyz"
     ),
     (
